@@ -74,6 +74,9 @@ class SceneModel(nn.Module):
     needs_training: bool = True
     """False for models that have nothing to learn by gradient (the classical yardsticks)."""
 
+    needs_labels: bool = False
+    """True for models that read the ground truth (the oracle): `from_labels` takes the place of `forward`."""
+
     def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
         """Called once before training starts from scratch, with the training set's per-pixel median in [0, 1].
 
@@ -83,6 +86,10 @@ class SceneModel(nn.Module):
     def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
         """RGB video in [0, 1] and the scheduled values at this step -> `Scene`."""
         raise TypeError(f"{type(self).__name__} does not define forward(video, schedule)")
+
+    def from_labels(self, video: Float[Tensor, "B T 3 H W"], segmentation: Int[Tensor, "B T H W"]) -> Scene:
+        """RGB video in [0, 1] and its ground truth -> `Scene`; called in place of `forward` where `needs_labels`."""
+        raise TypeError(f"{type(self).__name__} does not read the ground truth: call forward(video, schedule)")
 
 
 def schedule_at(values: Mapping[str, float], device: torch.device | str = "cpu") -> dict[str, Tensor]:
