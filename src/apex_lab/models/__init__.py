@@ -1,1 +1,1 @@
-
+"""One folder per model; each is a `SceneModel`."""

@@ -1,0 +1,72 @@
+"""The background component: its posterior, its prior over time, and its decoder."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from apex_lab.nn.blocks import BroadcastDecoder, conv_norm, mlp
+from apex_lab.nn.distributions import Gaussian, gaussian_from, standard_normal
+
+Count = Annotated[int, Field(gt=0)]
+
+
+class Background(nn.Module):
+    """z_bg and its picture.
+
+    Args:
+        image_size: side of the image in pixels.
+        latent: length of z_bg.
+        width: channels of encoder and decoder.
+        bias_image: `none` is the paper's plain decoder. `learned` adds a full-resolution bias image to the decoder's
+            logits: a parameter, initialised at the training set's per-pixel median, as one initialises an output bias
+            at the mean of the data. A convolutional decoder needs thousands of steps to draw sharp static edges, and
+            until then the foreground explains them.
+    """
+
+    def __init__(
+        self,
+        image_size: Count,
+        latent: Count = 32,
+        width: Count = 32,
+        bias_image: Literal["none", "learned"] = "learned",
+    ) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [conv_norm(4, width, kernel=5, stride=4)]
+        side = image_size // 4
+        while side > 4:
+            layers.append(conv_norm(width, width, stride=2))
+            side = (side + 1) // 2
+        self.encoder = nn.Sequential(*layers, nn.Flatten(), mlp([width * side * side, 4 * latent, 2 * latent]))
+        self.transition = mlp([latent, 4 * latent, 2 * latent])
+        self.decoder = BroadcastDecoder(latent, image_size, width, 3)
+        self.bias_image = nn.Parameter(torch.zeros(3, image_size, image_size)) if bias_image == "learned" else None
+
+    def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
+        """Starts the picture at the training set's median, if there is a bias image."""
+        if self.bias_image is None:
+            return
+        with torch.no_grad():
+            self.bias_image.copy_(torch.logit(median, eps=0.02))
+            self.decoder.head.weight.mul_(0.1)
+            assert self.decoder.head.bias is not None
+            self.decoder.head.bias.zero_()
+
+    def posterior(self, mask: Float[Tensor, "N H W"], image: Float[Tensor, "N 3 H W"]) -> Gaussian:
+        """q(z_bg | m_bg, x): a CNN on the background mask and the image."""
+        return gaussian_from(self.encoder(torch.cat([mask[:, None], image], dim=1)))
+
+    def prior(self, z: Float[Tensor, "B T Z"]) -> Gaussian:
+        """p(z_bg_t | z_bg_{t-1}) for every frame; N(0, 1) at the first."""
+        first = standard_normal(z[:, :1])
+        later = gaussian_from(self.transition(z[:, :-1]))
+        return Gaussian(*(torch.cat([a, b], dim=1) for a, b in zip(first, later, strict=True)))
+
+    def decode(self, z: Float[Tensor, "N Z"]) -> Float[Tensor, "N 3 H W"]:
+        """z_bg -> RGB in [0, 1]."""
+        logit = self.decoder(z)
+        return torch.sigmoid(logit if self.bias_image is None else logit + self.bias_image)

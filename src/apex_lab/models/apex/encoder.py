@@ -1,0 +1,38 @@
+"""APEX's scene encoder: DLA per frame, then a ConvLSTM over time, output stride 4 (apex_paper, "Feature Extraction")."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from apex_lab.nn.conv_lstm import ConvLSTM
+from apex_lab.nn.dla import DLA
+
+Count = Annotated[int, Field(gt=0)]
+
+
+class ApexEncoder(nn.Module):
+    """Video -> feature maps e_t that see all frames up to t.
+
+    Args:
+        features: F.
+        widths: channels of the DLA's six levels (strides 1, 2, 4, 8, 16, 32).
+        depths: depths of its four aggregation trees.
+    """
+
+    stride = 4
+
+    def __init__(self, features: Count, widths: Sequence[Count], depths: Sequence[Count]) -> None:
+        super().__init__()
+        self.features = features
+        self.dla = DLA(features, widths, depths)
+        self.over_time = ConvLSTM(features)
+
+    def forward(self, video: Float[Tensor, "B T 3 H W"]) -> Float[Tensor, "B T F H/4 W/4"]:
+        """RGB in [0, 1] -> features; the DLA sees all B T frames as one batch."""
+        frames = self.dla(video.flatten(0, 1) - 0.5)
+        return self.over_time(frames.unflatten(0, video.shape[:2]))

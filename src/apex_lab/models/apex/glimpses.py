@@ -1,0 +1,87 @@
+"""Where glimpses and propagation crops are cut from: the feature map (APEX) or the image (`image_stn` ablation)."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from apex_lab.nn.blocks import GlimpseEncoder
+from apex_lab.nn.spatial_transformer import crop
+
+Size = Annotated[int, Field(ge=4, le=128)]
+Count = Annotated[int, Field(gt=0)]
+
+
+class Glimpses(nn.Module, ABC):
+    """Cuts windows out of its source and encodes them, with one CNN for glimpses and one for propagation crops.
+
+    Args:
+        size: side of a crop in pixels of the source.
+        width: channels of the two CNNs.
+    """
+
+    def __init__(self, size: Size, width: Count) -> None:
+        super().__init__()
+        self.size, self.width = size, width
+
+    def build(self, features: int, code: int) -> None:
+        """Makes the CNNs; called once by the model, which knows F and the length of a code."""
+        glimpse, propagation = self.channels(features)
+        self.glimpse = GlimpseEncoder(glimpse, self.size, self.width, code)
+        self.propagation = GlimpseEncoder(propagation, self.size, self.width, code)
+
+    @abstractmethod
+    def channels(self, features: int) -> tuple[int, int]:
+        """Channels of the sources of glimpses and of propagation crops."""
+
+    @abstractmethod
+    def sources(
+        self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]
+    ) -> tuple[Tensor, Tensor]:
+        """What glimpses and propagation crops are cut from, each (B, T, C, h, w)."""
+
+    def look(self, source: Float[Tensor, "B C h w"], window: Float[Tensor, "B K 4"]) -> Float[Tensor, "B K code"]:
+        """Codes of the glimpses (z_what's evidence)."""
+        return self._encode(self.glimpse, source, window)
+
+    def follow(self, source: Float[Tensor, "B C h w"], window: Float[Tensor, "B K 4"]) -> Float[Tensor, "B K code"]:
+        """Codes of the propagation crops, c_p."""
+        return self._encode(self.propagation, source, window)
+
+    def _encode(self, encoder: nn.Module, source: Tensor, window: Tensor) -> Tensor:
+        return encoder(crop(source, window, self.size).flatten(0, 1)).unflatten(0, window.shape[:2])
+
+
+class FeatureGlimpses(Glimpses):
+    """From the feature map e_t, as APEX does."""
+
+    def channels(self, features: int) -> tuple[int, int]:
+        """F for both."""
+        return features, features
+
+    def sources(
+        self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]
+    ) -> tuple[Tensor, Tensor]:
+        """The feature maps themselves."""
+        return features, features
+
+
+class ImageGlimpses(Glimpses):
+    """From the image x_t; a propagation crop also sees the previous frame, since motion is what it is for."""
+
+    def channels(self, features: int) -> tuple[int, int]:
+        """RGB; RGB of two frames."""
+        return 3, 6
+
+    def sources(
+        self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]
+    ) -> tuple[Tensor, Tensor]:
+        """x_t, and [x_t, x_{t-1}] (the first frame is its own predecessor)."""
+        centred = video - 0.5
+        before = torch.cat([centred[:, :1], centred[:, :-1]], dim=1)
+        return centred, torch.cat([centred, before], dim=2)

@@ -1,0 +1,183 @@
+"""Mask normalisation: APEX's (Eq. 7-12) and SCALOR's, which the `scalor_norm` ablation swaps in.
+
+Both answer the same three questions from glimpses of mask logits. Pixels are (H, W) = (size, size); an invalid
+component (a slot that holds nothing) adds exactly zero to the foreground and exactly -inf to the competition.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from typing import Annotated, Literal, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
+from pydantic import Field
+from torch import Tensor
+
+from apex_lab.nn.spatial_transformer import Paster
+
+TINY = 1e-30
+"""Floor inside logarithms; a mask below it is zero for every purpose in float32."""
+
+
+class Masks(NamedTuple):
+    """Masks of one set of components and of the background; logs are for the likelihood, shares for everything else.
+
+    objects: (..., K, H, W); foreground, background: (..., H, W). objects.sum(-3) + background = 1.
+    log_objects: -inf for invalid components; log_background: finite.
+    """
+
+    objects: Tensor
+    log_objects: Tensor
+    foreground: Tensor
+    background: Tensor
+    log_background: Tensor
+
+
+class MaskNormalisation(ABC):
+    """How mask logits of overlapping windows become masks that sum to one."""
+
+    @abstractmethod
+    def logits(self, raw: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """Decoder output -> alpha, the glimpse that all other methods take."""
+
+    @abstractmethod
+    def foreground(
+        self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster
+    ) -> Float[Tensor, "... H W"]:
+        """m_fg of these components alone, in [0, 1]; absent ones have a presence of exactly zero."""
+
+    @abstractmethod
+    def claim(self, alpha: Float[Tensor, "... K g g"], paster: Paster) -> Float[Tensor, "... K H W"]:
+        """What each component would cover on its own, in [0, 1], zero outside its window (p_context)."""
+
+    @abstractmethod
+    def compose(
+        self,
+        alpha: Float[Tensor, "... K g g"],
+        presence: Float[Tensor, "... K"],
+        valid: Bool[Tensor, "... K"],
+        paster: Paster,
+    ) -> Masks:
+        """All masks of a frame."""
+
+
+class ApexNormalisation(MaskNormalisation):
+    """APEX's mask normalisation, in log space throughout (Eq. 7-12).
+
+    Args:
+        c: bounds the mask logits to [-c, c] (Eq. 7).
+        outside: what a present component's logit counts outside its window: `zero` is the literal reading of Eq. 9 (the
+            warp pads with zeros), `minus_c` pads with the weakest logit.
+    """
+
+    def __init__(
+        self, c: Annotated[float, Field(gt=0)] = 5.0, outside: Literal["zero", "minus_c"] = "zero"
+    ) -> None:
+        self.c, self.outside = c, outside
+
+    def logits(self, raw: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """alpha = c tanh(CNN(z_what)) (Eq. 7)."""
+        return self.c * torch.tanh(raw)
+
+    def _occupancy(
+        self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster
+    ) -> Float[Tensor, "... H W"]:
+        """s = sum_k STN(softplus(alpha_k) z_pres_k), the argument of the tanh in Eq. 8."""
+        return paster.total(F.softplus(alpha) * presence[..., None, None])
+
+    def foreground(
+        self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster
+    ) -> Float[Tensor, "... H W"]:
+        """m_fg = tanh(s) (Eq. 8)."""
+        return torch.tanh(self._occupancy(alpha, presence, paster))
+
+    def claim(self, alpha: Float[Tensor, "... K g g"], paster: Paster) -> Float[Tensor, "... K H W"]:
+        """tanh(softplus(alpha)) of the warped logits, inside the window only (the weights of p_context, Eq. 18)."""
+        rows, columns = paster.inside()
+        warped = paster.each(alpha[..., None, :, :]).squeeze(-3)
+        return torch.tanh(F.softplus(warped)) * (rows[..., :, None] * columns[..., None, :])
+
+    def _competition(
+        self,
+        alpha: Float[Tensor, "... K g g"],
+        presence: Float[Tensor, "... K"],
+        valid: Bool[Tensor, "... K"],
+        paster: Paster,
+    ) -> Float[Tensor, "... K H W"]:
+        """alpha_hat = STN(alpha) + 2 c z_pres (Eq. 9); -inf for components that hold nothing."""
+        base = 0.0 if self.outside == "zero" else -self.c
+        warped = paster.each((alpha - base)[..., None, :, :]).squeeze(-3) + base
+        logit = warped + 2 * self.c * presence[..., None, None]
+        return logit.masked_fill(~valid[..., None, None], -torch.inf)
+
+    def compose(
+        self,
+        alpha: Float[Tensor, "... K g g"],
+        presence: Float[Tensor, "... K"],
+        valid: Bool[Tensor, "... K"],
+        paster: Paster,
+    ) -> Masks:
+        """Eq. 8-12: softmax over the foreground (Eq. 10), times m_fg (Eq. 11); the background is the rest (Eq. 12)."""
+        s = self._occupancy(alpha, presence, paster)
+        logit = self._competition(alpha, presence, valid, paster)
+        # Where nothing is valid the softmax has no finite entry; any finite stand-in will do, since m_fg is zero there.
+        log_norm = torch.logsumexp(logit, dim=-3).masked_fill(~valid.any(-1)[..., None, None], 0.0)
+        log_share = logit - log_norm[..., None, :, :]
+        foreground = torch.tanh(s)
+        log_foreground = torch.log(torch.tanh(s.clamp_min(TINY)))
+        return Masks(
+            objects=log_share.exp() * foreground[..., None, :, :],
+            log_objects=log_share + log_foreground[..., None, :, :],
+            foreground=foreground,
+            background=2 * torch.sigmoid(-2 * s),  # = 1 - tanh(s), without cancellation
+            log_background=F.logsigmoid(-2 * s) + math.log(2),
+        )
+
+
+class ScalorNormalisation(MaskNormalisation):
+    """SCALOR's mask normalisation, for the ablations (apex_paper, "Ablation Study").
+
+    Masks alpha^s in [0, 1] are warped, weighted by presence and normalised as alpha_k^2 / sum_k alpha_k; the foreground
+    is clamped to [0, 1] and the background is the rest.
+    """
+
+    def logits(self, raw: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """alpha^s = sigmoid(CNN(z_what))."""
+        return torch.sigmoid(raw)
+
+    def _warped(
+        self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster
+    ) -> Float[Tensor, "... K H W"]:
+        return paster.each((alpha * presence[..., None, None])[..., None, :, :]).squeeze(-3)
+
+    @staticmethod
+    def _normalised(warped: Float[Tensor, "... K H W"]) -> tuple[Tensor, Tensor]:
+        objects = warped.square() / warped.sum(-3, keepdim=True).clamp_min(1e-6)
+        return objects, objects.sum(-3).clamp(0, 1)
+
+    def foreground(
+        self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster
+    ) -> Float[Tensor, "... H W"]:
+        """The clamped sum of the normalised masks."""
+        return self._normalised(self._warped(alpha, presence, paster))[1]
+
+    def claim(self, alpha: Float[Tensor, "... K g g"], paster: Paster) -> Float[Tensor, "... K H W"]:
+        """The warped mask itself."""
+        return paster.each(alpha[..., None, :, :]).squeeze(-3)
+
+    def compose(
+        self,
+        alpha: Float[Tensor, "... K g g"],
+        presence: Float[Tensor, "... K"],
+        valid: Bool[Tensor, "... K"],
+        paster: Paster,
+    ) -> Masks:
+        """alpha^2 / sum(alpha); absent components have a presence of zero, hence a mask of zero."""
+        present = torch.where(valid, presence, torch.zeros_like(presence))
+        objects, foreground = self._normalised(self._warped(alpha, present, paster))
+        background = 1 - foreground
+        log_objects = objects.clamp_min(TINY).log().masked_fill(~valid[..., None, None], -torch.inf)
+        return Masks(objects, log_objects, foreground, background, background.clamp_min(1e-6).log())

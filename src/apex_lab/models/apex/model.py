@@ -1,0 +1,283 @@
+"""APEX: the model (apex_paper, section "APEX"; apex.md)."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from apex_lab.models.apex.background import Background
+from apex_lab.models.apex.encoder import ApexEncoder
+from apex_lab.models.apex.glimpses import Glimpses
+from apex_lab.models.apex.likelihood import Likelihood
+from apex_lab.models.apex.masks import MaskNormalisation, Masks
+from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, mask_entropy
+from apex_lab.models.apex.objects import (
+    Appearance,
+    Discovery,
+    Objects,
+    Propagation,
+    Proposals,
+    context_probability,
+    sample_presence,
+    scope_in_windows,
+)
+from apex_lab.models.apex.rollout import Step, stack_steps
+from apex_lab.models.apex.slots import carry, gather_slots
+from apex_lab.models.apex.windows import Windows, size_logit, window_of
+from apex_lab.nn.blocks import SubpixelDecoder
+from apex_lab.nn.distributions import kl_gaussian
+from apex_lab.nn.spatial_transformer import Paster
+from apex_lab.scene import ABSENT, Scene, SceneModel, Schedule
+
+Count = Annotated[int, Field(gt=0)]
+Share = Annotated[float, Field(gt=0, lt=1)]
+Positive = Annotated[float, Field(gt=0)]
+
+BACKGROUND_ID = 0
+FIRST_ID = 1
+
+
+class Apex(SceneModel):
+    """Amortised Parallel infErence with miXture models.
+
+    Args:
+        image_size: H = W in pixels, a multiple of 32.
+        encoder: video -> feature maps.
+        glimpses: where glimpses come from, and their CNNs.
+        masks: mask normalisation.
+        likelihood: of the image.
+        background: the background component.
+        discovery_prior: of discovered objects' windows.
+        what: length of z_what.
+        hidden: of the recurrent networks.
+        grid: G; discovery has G^2 cells.
+        max_objects: P, slots that carry objects from frame to frame.
+        render_top: N, how many discovery cells per frame are rendered, by presence probability; null renders all.
+        glimpse_size: side of the decoded glimpses in pixels.
+        decoder_width: channels of the glimpse decoders.
+        kl: direction of the KL of z_what and z_where; the paper minimises the inclusive one, KL(p || q).
+        keep_threshold: objects with a z_pres below it are not carried on.
+        reach: of a discovered window's centre, in cells.
+        size_step, centre_step: largest change per frame of a size logit and of a centre.
+        start_size: window size at the start of training, as a share of the image side.
+        start_presence: p_proposal at the start of training.
+    """
+
+    term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
+    schedule_names = ("temperature", "discovery_presence")
+
+    def __init__(
+        self,
+        image_size: Count,
+        encoder: ApexEncoder,
+        glimpses: Glimpses,
+        masks: MaskNormalisation,
+        likelihood: Likelihood,
+        background: Background,
+        discovery_prior: DiscoveryPrior,
+        what: Count = 64,
+        hidden: Count = 128,
+        grid: Count = 8,
+        max_objects: Count = 10,
+        render_top: Count | None = 10,
+        glimpse_size: Count = 32,
+        decoder_width: Count = 16,
+        kl: Direction = "inclusive",
+        keep_threshold: Share = 0.5,
+        reach: Positive = 1.5,
+        size_step: Positive = 0.3,
+        centre_step: Positive = 0.2,
+        start_size: Share = 0.25,
+        start_presence: Share = 0.1,
+    ) -> None:
+        super().__init__()
+        if image_size % 32 or (image_size // encoder.stride) % grid:
+            raise ValueError(
+                f"model.image_size={image_size} must be a multiple of 32 whose quarter is a multiple of model.grid={grid}"
+            )
+        self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
+        self.render_top = min(render_top or grid**2, grid**2)
+        self.direction, self.keep_threshold = kl, keep_threshold
+        self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
+        self.encoder, self.glimpses, self.background = encoder, glimpses, background
+        self.glimpses.build(encoder.features, hidden)
+        windows = Windows(grid, reach, size_step, centre_step)
+        self.appearance = Appearance(hidden, what, hidden)
+        self.propagation = Propagation(hidden, what, hidden, windows)
+        self.discovery = Discovery(
+            encoder.features, grid, what, hidden, windows, size_logit(start_size), start_presence
+        )
+        self.mask_decoder = SubpixelDecoder(what, glimpse_size, decoder_width, 1)
+        self.colour_decoder = SubpixelDecoder(what, glimpse_size, decoder_width, 3)
+
+    def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
+        """Starts the background at the training set's median."""
+        self.background.initialise(median)
+
+    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
+        """Explains a video (Eq. 14: propagated objects, then discovered ones, then the background, per frame).
+
+        Args:
+            video: RGB in [0, 1].
+            schedule: `temperature` of the relaxed Bernoulli, `discovery_presence` p0.
+        """
+        if video.shape[-2:] != (self.image_size, self.image_size):
+            raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
+        features = self.encoder(video)
+        look_at, follow_in = self.glimpses.sources(video, features)
+        proposals = self.discovery(features, look_at, self.glimpses, self.appearance, self.training)
+        steps = self._roll_out(look_at, follow_in, proposals, schedule)
+        return self._explain(video, proposals, steps)
+
+    def _alpha(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch g g"]:
+        raw = self.mask_decoder(what.reshape(-1, what.shape[-1]))
+        return self.masks.logits(raw).reshape(*what.shape[:-1], *raw.shape[-2:])
+
+    def _paster(self, place: Float[Tensor, "*batch 4"], glimpse: int) -> Paster:
+        return Paster(window_of(place), glimpse, self.image_size)
+
+    def _roll_out(self, look_at: Tensor, follow_in: Tensor, proposals: Proposals, schedule: Schedule) -> Step:
+        """The part that depends on the frame before, frame by frame."""
+        b, t = look_at.shape[:2]
+        slots = self.max_objects
+        state = Objects.empty(b, slots, proposals.what.shape[-1], self.hidden, proposals.what)
+        valid = torch.zeros(b, slots, dtype=torch.bool, device=look_at.device)
+        ids = torch.full((b, slots), ABSENT, device=look_at.device)
+        next_id = torch.full((b,), FIRST_ID, device=look_at.device)
+        # Masks of all proposals of all frames, before the loop: only the scope they are held against depends on it.
+        alphas = self._alpha(proposals.what)
+        paster = self._paster(proposals.place, alphas.shape[-1])
+        claims = self.masks.claim(alphas, paster)
+        rows, columns = paster.inside()
+        steps = []
+        for i in range(t):
+            before, beliefs = self.propagation(
+                state,
+                self.glimpses,
+                self.appearance,
+                look_at[:, i],
+                follow_in[:, i],
+                valid,
+                schedule["temperature"],
+                self.training,
+            )
+            alpha = self._alpha(before.what)
+            scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
+
+            prob = proposals.prob[:, i] * context_probability(scope, claims[:, i])  # Eq. 17
+            prior = schedule["discovery_presence"] * scope_in_windows(scope, rows[:, i], columns[:, i])
+            pres = sample_presence(prob, schedule["temperature"], self.training)
+            top = prob.detach().topk(self.render_top, dim=1).indices
+            found = self._found(proposals, i, pres, top)
+
+            candidates = Objects.join(before, found)
+            exists = torch.cat([valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
+            kept = carry(candidates.presence, exists, ids, next_id, self.keep_threshold)
+            steps.append(
+                Step(
+                    candidates.what,
+                    candidates.place,
+                    torch.cat([alpha, gather_slots(alphas[:, i], top)], dim=1),
+                    candidates.presence,
+                    exists & (candidates.presence > 0),
+                    beliefs,
+                    prob,
+                    prior,
+                    pres,
+                    kept.source,
+                    kept.valid,
+                    kept.ids,
+                )
+            )
+            state, valid, ids, next_id = candidates.gather(kept.source), kept.valid, kept.ids, kept.next_id
+        return stack_steps(steps)
+
+    def _found(self, proposals: Proposals, frame: int, pres: Tensor, top: Tensor) -> Objects:
+        """The rendered discoveries of a frame as objects; their other recurrent states start at zero."""
+        nothing = pres.new_zeros(*top.shape, self.hidden)
+        return Objects(
+            gather_slots(proposals.what[:, frame], top),
+            gather_slots(proposals.place[:, frame], top),
+            gather_slots(pres, top),
+            nothing,
+            gather_slots(proposals.hidden_what[:, frame], top),
+            nothing,
+            nothing,
+        )
+
+    def _explain(self, video: Tensor, proposals: Proposals, steps: Step) -> Scene:
+        """Rendering, likelihood, KL and the result, for all frames at once."""
+        b, t = video.shape[:2]
+        paster = self._paster(steps.place, steps.alpha.shape[-1])
+        masks = self.masks.compose(steps.alpha, steps.presence, steps.valid, paster)
+        colours = torch.sigmoid(self.colour_decoder(steps.what.flatten(0, 2))).unflatten(0, steps.presence.shape)
+        means = paster.each(colours)  # (B, T, R, 3, H, W)
+
+        q_background = self.background.posterior(masks.background.flatten(0, 1), video.flatten(0, 1))
+        z_background = q_background.sample(self.training)
+        backdrop = self.background.decode(z_background)
+        p_background = self.background.prior(z_background.unflatten(0, (b, t)))
+        kl_background = kl_gaussian(type(q_background)(*(x.unflatten(0, (b, t)) for x in q_background)), p_background)
+
+        log_likelihood = self.likelihood(
+            video.flatten(0, 1),
+            masks.log_objects.flatten(0, 1),
+            means.flatten(0, 1),
+            masks.log_background.flatten(0, 1),
+            backdrop,
+        )
+        slots = self.max_objects
+        terms = {
+            "nll": -log_likelihood.unflatten(0, (b, t)).sum(1),
+            **kl_terms(
+                steps.propagated,
+                steps.valid[..., :slots],
+                steps.presence[..., :slots],
+                proposals,
+                steps.discovery_prob,
+                steps.discovery_prior,
+                steps.discovery_pres,
+                self.discovery_prior,
+                self.direction,
+            ),
+            "kl_background": kl_background.sum(1),
+            "mask_entropy": mask_entropy(masks).sum(1),
+        }
+        return self._scene(steps, masks, means, backdrop.unflatten(0, (b, t)), terms)
+
+    def _scene(self, steps: Step, masks: Masks, means: Tensor, backdrop: Tensor, terms: dict[str, Tensor]) -> Scene:
+        """The P objects carried on and the background, last. Pixels of objects that were dropped become background."""
+        b, t = steps.source.shape[:2]
+        flat = steps.source.flatten(0, 1)
+
+        def held(values: Tensor) -> Tensor:
+            return gather_slots(values.flatten(0, 1), flat).unflatten(0, (b, t))
+
+        carried = steps.carried
+        objects = held(masks.objects) * carried[..., None, None]
+        presence = held(steps.presence) * carried
+        window = window_of(held(steps.place)).masked_fill(~carried[..., None], torch.nan)
+        what = held(steps.what) * carried[..., None]
+        blend = (masks.objects[..., None, :, :] * means).sum(2) + masks.background[..., None, :, :] * backdrop
+        live = carried.sum(-1).clamp_min(1)
+        return Scene(
+            masks=torch.cat([objects, 1 - objects.sum(2, keepdim=True)], dim=2),
+            background=torch.arange(self.max_objects + 1, device=carried.device) == self.max_objects,
+            ids=torch.cat([steps.ids, torch.full_like(steps.ids[..., :1], BACKGROUND_ID)], dim=-1),
+            presence=torch.cat([presence, torch.ones_like(presence[..., :1])], dim=-1),
+            appearance=torch.cat([what, torch.zeros_like(what[..., :1, :])], dim=2),
+            reconstruction=blend,
+            terms=terms,
+            windows=torch.cat([window, torch.full_like(window[..., :1, :], torch.nan)], dim=2),
+            means=None if self.training else torch.cat([held(means), backdrop[:, :, None]], dim=2),
+            diagnostics={
+                "live_objects": carried.float().sum(-1).mean(),
+                "foreground": masks.foreground.mean(),
+                "window_size": (window[..., :2].mean(-1).nan_to_num().sum(-1) / live).mean(),
+                "discovery_prob": steps.discovery_prob.mean(),
+            },
+        )

@@ -1,0 +1,260 @@
+"""Foreground objects: what is inferred about each of them, by propagation and by discovery, and what was expected.
+
+Symbols as in apex.md: z_what (appearance and mask), z_where (window), z_pres (presence).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from apex_lab.models.apex.glimpses import Glimpses
+from apex_lab.models.apex.slots import gather_slots
+from apex_lab.models.apex.windows import Windows, square_of, window_of
+from apex_lab.nn.blocks import mlp
+from apex_lab.nn.distributions import Gaussian, gaussian_from, relaxed_bernoulli
+
+
+class Objects(NamedTuple):
+    """State of K objects after a frame; everything that the next frame needs.
+
+    what (B, K, Z); place (B, K, 4), see windows.py; presence (B, K) in [0, 1]; hidden states of the four recurrent
+    networks (B, K, hidden).
+    """
+
+    what: Tensor
+    place: Tensor
+    presence: Tensor
+    hidden_where: Tensor
+    hidden_what: Tensor
+    hidden_pres: Tensor
+    hidden_prior: Tensor
+
+    def gather(self, source: Tensor) -> Objects:
+        """The objects at `source` (B, S)."""
+        return Objects(*(gather_slots(field, source) for field in self))
+
+    @staticmethod
+    def join(a: Objects, b: Objects) -> Objects:
+        """The objects of `a`, then those of `b`."""
+        return Objects(*(torch.cat(pair, dim=1) for pair in zip(a, b, strict=True)))
+
+    @staticmethod
+    def empty(batch: int, slots: int, what: int, hidden: int, like: Tensor) -> Objects:
+        """`slots` empty slots per video."""
+        zeros = [like.new_zeros(batch, slots, n) for n in (what, 4, hidden, hidden, hidden, hidden)]
+        return Objects(zeros[0], zeros[1], like.new_zeros(batch, slots), *zeros[2:])
+
+
+class Beliefs(NamedTuple):
+    """Distributions of one set of objects: q (posterior) and p (prior)."""
+
+    q_where: Gaussian
+    p_where: Gaussian
+    q_what: Gaussian
+    p_what: Gaussian
+    q_pres: Tensor
+    p_pres: Tensor
+
+
+def sample_presence(prob: Tensor, temperature: Tensor, stochastic: bool) -> Tensor:
+    """Relaxed Bernoulli in training; the hard decision prob > 0.5 in evaluation."""
+    return relaxed_bernoulli(prob, temperature) if stochastic else (prob > 0.5).to(prob.dtype)
+
+
+def _set_last_bias(network: nn.Sequential, values: Float[Tensor, "n"], shrink: float = 0.1) -> None:
+    """Starts a head at a chosen output: small weights, given biases."""
+    last = network[-1]
+    assert isinstance(last, nn.Linear)
+    with torch.no_grad():
+        last.weight.mul_(shrink)
+        last.bias.copy_(values)
+
+
+class Appearance(nn.Module):
+    """q(z_what): one RNN on [glimpse code, z_what_{t-1}], shared by propagation and discovery (z_what_0 = 0)."""
+
+    def __init__(self, code: int, what: int, hidden: int) -> None:
+        super().__init__()
+        self.what = what
+        self.rnn = nn.GRUCell(code + what, hidden)
+        self.head = nn.Linear(hidden, 2 * what)
+
+    def forward(self, code: Tensor, what: Tensor, hidden: Tensor) -> tuple[Gaussian, Tensor]:
+        """(N, code), (N, Z), (N, hidden) -> q(z_what), new hidden state."""
+        hidden = self.rnn(torch.cat([code, what], dim=-1), hidden)
+        return gaussian_from(self.head(hidden)), hidden
+
+
+class Propagation(nn.Module):
+    """q and p of objects that existed in the frame before (apex.md, step 2; priors, "Generative side").
+
+    Args:
+        code: length of a glimpse code.
+        what: length of z_what.
+        hidden: of the recurrent networks.
+        windows: squashes z_where.
+    """
+
+    def __init__(self, code: int, what: int, hidden: int, windows: Windows) -> None:
+        super().__init__()
+        self.windows = windows
+        self.rnn_where = nn.GRUCell(code + what + 4, hidden)
+        self.rnn_pres = nn.GRUCell(code + what + 1, hidden)
+        self.rnn_prior = nn.GRUCell(what + 5, hidden)
+        self.head_where = mlp([hidden, hidden, 8])
+        self.head_pres = mlp([hidden, hidden, 1])
+        self.prior_what = mlp([hidden, hidden, 2 * what])
+        self.prior_where = mlp([hidden, hidden, 8])
+        self.prior_pres = mlp([hidden, hidden, 1])
+        still = torch.tensor([0.0] * 4 + [-2.0] * 4)  # no change, std 0.13
+        _set_last_bias(self.head_where, still)
+        _set_last_bias(self.prior_where, still)
+        stays = torch.tensor([3.0])  # an object that was there is expected to be there
+        _set_last_bias(self.head_pres, stays)
+        _set_last_bias(self.prior_pres, stays)
+
+    def forward(
+        self,
+        before: Objects,
+        glimpses: Glimpses,
+        appearance: Appearance,
+        glimpse_source: Float[Tensor, "B C h w"],
+        crop_source: Float[Tensor, "B C2 h w"],
+        valid: Bool[Tensor, "B P"],
+        temperature: Tensor,
+        stochastic: bool,
+    ) -> tuple[Objects, Beliefs]:
+        """Objects at t - 1 and the sources at t -> objects at t, and what was believed and expected of them."""
+        b, p = before.presence.shape
+
+        def each(cell: nn.GRUCell, hidden: Tensor, *inputs: Tensor) -> Tensor:
+            return cell(torch.cat(inputs, dim=-1).flatten(0, 1), hidden.flatten(0, 1)).unflatten(0, (b, p))
+
+        window = window_of(before.place)
+        presence = before.presence[..., None]
+        hidden_prior = each(self.rnn_prior, before.hidden_prior, before.what, window, presence)
+
+        crop_code = glimpses.follow(crop_source, square_of(window))
+        hidden_where = each(self.rnn_where, before.hidden_where, crop_code, before.what, window)
+        q_where = gaussian_from(self.head_where(hidden_where))
+        place = self.windows.propagated(before.place, q_where.sample(stochastic))
+
+        code = glimpses.look(glimpse_source, window_of(place))
+        q_flat, hidden_flat = appearance(
+            code.flatten(0, 1), before.what.flatten(0, 1), before.hidden_what.flatten(0, 1)
+        )
+        q_what, hidden_what = Gaussian(*(x.unflatten(0, (b, p)) for x in q_flat)), hidden_flat.unflatten(0, (b, p))
+        what = q_what.sample(stochastic)
+
+        hidden_pres = each(self.rnn_pres, before.hidden_pres, crop_code, what, presence)
+        q_pres = torch.sigmoid(self.head_pres(hidden_pres)).squeeze(-1)
+        z_pres = torch.where(valid, sample_presence(q_pres, temperature, stochastic), torch.zeros_like(q_pres))
+
+        beliefs = Beliefs(
+            q_where,
+            gaussian_from(self.prior_where(hidden_prior)),
+            q_what,
+            gaussian_from(self.prior_what(hidden_prior)),
+            q_pres,
+            torch.sigmoid(self.prior_pres(hidden_prior)).squeeze(-1),
+        )
+        return Objects(what, place, z_pres, hidden_where, hidden_what, hidden_pres, hidden_prior), beliefs
+
+
+class Proposals(NamedTuple):
+    """What discovery proposes in every cell of every frame, before the context is known; (B, T, D, ...).
+
+    q_where, q_what; what, place: samples; prob: p_proposal; hidden_what: of the appearance RNN.
+    """
+
+    q_where: Gaussian
+    q_what: Gaussian
+    what: Tensor
+    place: Tensor
+    prob: Tensor
+    hidden_what: Tensor
+
+
+class Discovery(nn.Module):
+    """Proposals of new objects (apex.md, step 4). Nothing here depends on the frame before, so all frames run at once.
+
+    Args:
+        features: F.
+        grid: G, cells per side.
+        what, hidden: as in `Propagation`.
+        windows: squashes z_where.
+        size_logit: mean of the window size's logit at the start of training.
+        presence: p_proposal at the start of training, in (0, 1).
+    """
+
+    def __init__(
+        self, features: int, grid: int, what: int, hidden: int, windows: Windows, size_logit: float, presence: float
+    ) -> None:
+        super().__init__()
+        self.grid, self.windows = grid, windows
+        self.head_where = nn.Conv2d(features, 8, 1)
+        self.head_pres = mlp([features + what + 4, hidden, 1])
+        with torch.no_grad():
+            self.head_where.weight.mul_(0.1)
+            assert self.head_where.bias is not None
+            self.head_where.bias.copy_(torch.tensor([size_logit] * 2 + [0.0] * 2 + [-2.0] * 4))
+        _set_last_bias(self.head_pres, torch.logit(torch.tensor([presence])))
+
+    def forward(
+        self,
+        features: Float[Tensor, "B T F h w"],
+        glimpse_source: Float[Tensor, "B T C h2 w2"],
+        glimpses: Glimpses,
+        appearance: Appearance,
+        stochastic: bool,
+    ) -> Proposals:
+        """Feature maps -> proposals of all cells of all frames."""
+        b, t = features.shape[:2]
+        step = features.shape[-1] // self.grid
+        cells = features.flatten(0, 1)[..., step // 2 :: step, step // 2 :: step]  # c_d, equally spaced
+        d = self.grid**2
+        q_where = gaussian_from(self.head_where(cells).flatten(2).transpose(1, 2))  # (B T, D, 4)
+        place = self.windows.discovered(q_where.sample(stochastic))
+        window = window_of(place)
+
+        code = glimpses.look(glimpse_source.flatten(0, 1), window).flatten(0, 1)
+        nothing = code.new_zeros(code.shape[0], appearance.what)
+        q_what, hidden = appearance(code, nothing, code.new_zeros(code.shape[0], appearance.rnn.hidden_size))
+        what = q_what.sample(stochastic).unflatten(0, (b * t, d))
+
+        evidence = torch.cat([cells.flatten(2).transpose(1, 2), what, window], dim=-1)
+        prob = torch.sigmoid(self.head_pres(evidence)).squeeze(-1)
+
+        def over_time(x: Tensor) -> Tensor:
+            return x.reshape(b, t, d, *x.shape[2:])
+
+        return Proposals(
+            Gaussian(over_time(q_where.mean), over_time(q_where.std)),
+            Gaussian(*(x.reshape(b, t, d, -1) for x in q_what)),
+            over_time(what),
+            over_time(place),
+            over_time(prob),
+            hidden.reshape(b, t, d, -1),
+        )
+
+
+def scope_in_windows(
+    scope: Float[Tensor, "B H W"], rows: Float[Tensor, "B D H"], columns: Float[Tensor, "B D W"]
+) -> Float[Tensor, "B D"]:
+    """Share of each cell's window that the propagated objects leave unexplained, in [0, 1] (discovery's prior)."""
+    inside = torch.einsum("bdh,bhw,bdw->bd", rows, scope, columns)
+    return inside / (rows.sum(-1) * columns.sum(-1)).clamp_min(1e-6)
+
+
+def context_probability(
+    scope: Float[Tensor, "B H W"], claims: Float[Tensor, "B D H W"]
+) -> Float[Tensor, "B D"]:
+    """p_context: share of each proposal's mask that is not yet explained, in [0, 1] (Eq. 18)."""
+    claims = claims.flatten(2)
+    open_ = (claims @ scope.flatten(1)[..., None]).squeeze(-1)
+    tiny = 1e-6  # a window too small to hold a pixel centre claims nothing: its context is fully open
+    return ((open_ + tiny) / (claims.sum(-1) + tiny)).clamp(0, 1)

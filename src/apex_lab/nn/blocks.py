@@ -1,0 +1,111 @@
+"""Small building blocks: normalised convolutions, perceptrons, sub-pixel and broadcast decoders."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from apex_lab.nn.spatial_transformer import pixel_centres
+
+
+def group_norm(channels: int, per_group: int = 8) -> nn.GroupNorm:
+    """GroupNorm with groups of about `per_group` channels; the number of groups divides `channels`."""
+    return nn.GroupNorm(math.gcd(channels, max(1, channels // per_group)), channels)
+
+
+def conv_norm(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn.Sequential:
+    """Convolution, GroupNorm, ReLU."""
+    conv = nn.Conv2d(inputs, outputs, kernel, stride, padding=kernel // 2, bias=False)
+    return nn.Sequential(conv, group_norm(outputs), nn.ReLU(inplace=True))
+
+
+def mlp(sizes: Sequence[int]) -> nn.Sequential:
+    """Linear layers with CELU between them; the last one is linear."""
+    layers: list[nn.Module] = []
+    for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True):
+        layers += [nn.Linear(inputs, outputs), nn.CELU()]
+    return nn.Sequential(*layers[:-1])
+
+
+class GlimpseEncoder(nn.Module):
+    """CNN from a crop to a vector: strided convolutions down to 4 x 4 or less, then one linear layer.
+
+    Args:
+        channels: of the crop.
+        size: side of the crop in pixels.
+        width: channels of the convolutions.
+        outputs: length of the code.
+    """
+
+    def __init__(self, channels: int, size: int, width: int, outputs: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = [conv_norm(channels, width)]
+        while size > 4:
+            layers.append(conv_norm(width, width, stride=2))
+            size = (size + 1) // 2
+        self.convs = nn.Sequential(*layers)
+        self.head = nn.Sequential(nn.Linear(width * size * size, outputs), nn.CELU())
+
+    def forward(self, crops: Float[Tensor, "N C g g"]) -> Float[Tensor, "N outputs"]:
+        return self.head(self.convs(crops).flatten(1))
+
+
+class SubpixelDecoder(nn.Module):
+    """CNN from a latent vector to a square picture: 4 x 4, then doubled by sub-pixel convolutions up to `size`.
+
+    Args:
+        latent: length of the latent vector.
+        size: side of the picture in pixels, 4 times a power of two.
+        width: channels before the last doubling; each level below has twice as many, at most 4 x.
+        outputs: channels of the picture (linear).
+    """
+
+    def __init__(self, latent: int, size: int, width: int, outputs: int) -> None:
+        super().__init__()
+        doublings = round(math.log2(size / 4))
+        if doublings < 1 or 4 * 2**doublings != size:
+            raise ValueError(f"a glimpse of {size} pixels is not 4 times a power of two, such as 16, 32 or 64")
+        widths = [width * min(4, 2 ** (doublings - 1 - i)) for i in range(doublings)]
+        self.stem = nn.Linear(latent, widths[0] * 16)
+        blocks: list[nn.Module] = [nn.Unflatten(1, (widths[0], 4, 4)), nn.CELU()]
+        for inputs, after in zip(widths, [*widths[1:], width], strict=True):
+            blocks += [nn.Conv2d(inputs, 4 * after, 3, padding=1), nn.PixelShuffle(2), group_norm(after), nn.CELU()]
+        self.blocks = nn.Sequential(*blocks)
+        self.head = nn.Conv2d(width, outputs, 3, padding=1)
+
+    def forward(self, latent: Float[Tensor, "N latent"]) -> Float[Tensor, "N outputs size size"]:
+        return self.head(self.blocks(self.stem(latent)))
+
+
+class BroadcastDecoder(nn.Module):
+    """Spatial broadcast decoder (Watters et al. 2019) on a coarse grid, brought to full size by sub-pixel convolutions.
+
+    Args:
+        latent: length of the latent vector.
+        size: side of the picture in pixels.
+        width: channels.
+        outputs: channels of the picture (linear).
+        coarse: the grid is `size / coarse`; a power of two.
+    """
+
+    def __init__(self, latent: int, size: int, width: int, outputs: int, coarse: int = 8) -> None:
+        super().__init__()
+        if size % coarse:
+            raise ValueError(f"image size {size} is not a multiple of {coarse}")
+        self.grid = size // coarse
+        self.stem = nn.Linear(latent, width)
+        self.place = nn.Conv2d(2, width, 1)
+        blocks: list[nn.Module] = [nn.CELU(), nn.Conv2d(width, width, 3, padding=1), nn.CELU()]
+        for _ in range(round(math.log2(coarse))):
+            blocks += [nn.Conv2d(width, 4 * width, 3, padding=1), nn.PixelShuffle(2), nn.CELU()]
+        self.blocks = nn.Sequential(*blocks)
+        self.head = nn.Conv2d(width, outputs, 3, padding=1)
+
+    def forward(self, latent: Float[Tensor, "N latent"]) -> Float[Tensor, "N outputs size size"]:
+        axis = pixel_centres(self.grid, latent)
+        coordinates = torch.stack(torch.meshgrid(axis, axis, indexing="ij"))[None]
+        return self.head(self.blocks(self.stem(latent)[..., None, None] + self.place(coordinates)))

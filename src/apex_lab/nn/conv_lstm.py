@@ -1,0 +1,41 @@
+"""Convolutional LSTM (Shi et al. 2015) over feature maps of a video."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class ConvLSTM(nn.Module):
+    """One ConvLSTM layer with as many hidden as input channels.
+
+    The convolution over the inputs does not depend on time, so it runs once for all frames; only the hidden state's
+    convolution is inside the loop.
+
+    Args:
+        channels: of the feature map, in and out.
+        kernel: side of both convolutions.
+    """
+
+    def __init__(self, channels: int, kernel: int = 3) -> None:
+        super().__init__()
+        self.from_input = nn.Conv2d(channels, 4 * channels, kernel, padding=kernel // 2)
+        self.from_hidden = nn.Conv2d(channels, 4 * channels, kernel, padding=kernel // 2, bias=False)
+        with torch.no_grad():  # start by remembering: forget gates half open would blur the first steps
+            assert self.from_input.bias is not None
+            self.from_input.bias[channels : 2 * channels] = 1.0
+
+    def forward(self, features: Float[Tensor, "B T C h w"]) -> Float[Tensor, "B T C h w"]:
+        """Hidden states of all frames, from a zero state before the first."""
+        b, t = features.shape[:2]
+        driven = self.from_input(features.flatten(0, 1)).unflatten(0, (b, t))
+        hidden = torch.zeros_like(features[:, 0])
+        cell = torch.zeros_like(hidden)
+        states = []
+        for frame in driven.unbind(1):
+            gates_in, forget, out, candidate = (frame + self.from_hidden(hidden)).chunk(4, dim=1)
+            cell = torch.sigmoid(forget) * cell + torch.sigmoid(gates_in) * torch.tanh(candidate)
+            hidden = torch.sigmoid(out) * torch.tanh(cell)
+            states.append(hidden)
+        return torch.stack(states, dim=1)

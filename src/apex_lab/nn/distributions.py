@@ -1,0 +1,55 @@
+"""Gaussian and Bernoulli latents: reparameterised samples and closed-form KL divergences."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+
+class Gaussian(NamedTuple):
+    """A diagonal Gaussian: mean and standard deviation, both (..., D)."""
+
+    mean: Tensor
+    std: Tensor
+
+    def sample(self, stochastic: bool) -> Tensor:
+        """Reparameterised sample, or the mean."""
+        return self.mean + self.std * torch.randn_like(self.mean) if stochastic else self.mean
+
+
+def gaussian_from(raw: Float[Tensor, "... two_D"], min_std: float = 1e-3, max_std: float = 5.0) -> Gaussian:
+    """Splits a head's output into a mean and a standard deviation, softplus-bounded to [min_std, max_std]."""
+    mean, spread = raw.chunk(2, dim=-1)
+    return Gaussian(mean, (F.softplus(spread) + min_std).clamp_max(max_std))
+
+
+def standard_normal(like: Tensor) -> Gaussian:
+    """N(0, 1) in the shape of `like`."""
+    return Gaussian(torch.zeros_like(like), torch.ones_like(like))
+
+
+def kl_gaussian(a: Gaussian, b: Gaussian) -> Float[Tensor, "..."]:
+    """KL(a || b), summed over the last dimension; nats.
+
+    The inclusive KL(p || q) of the paper is `kl_gaussian(p, q)`, the exclusive one `kl_gaussian(q, p)`.
+    """
+    ratio = (a.std / b.std).square()
+    shift = ((a.mean - b.mean) / b.std).square()
+    return 0.5 * (ratio + shift - 1 - ratio.log()).sum(-1)
+
+
+def kl_bernoulli(q: Float[Tensor, "..."], p: Float[Tensor, "..."], tiny: float = 1e-6) -> Float[Tensor, "..."]:
+    """KL(Bernoulli(q) || Bernoulli(p)) of probabilities, elementwise; nats. Probabilities are kept `tiny` from 0, 1."""
+    q, p = q.clamp(tiny, 1 - tiny), p.clamp(tiny, 1 - tiny)
+    return q * (q.log() - p.log()) + (1 - q) * ((-q).log1p() - (-p).log1p())
+
+
+def relaxed_bernoulli(prob: Float[Tensor, "..."], temperature: Tensor, tiny: float = 1e-6) -> Float[Tensor, "..."]:
+    """Reparameterised sample of the binary Gumbel-softmax (concrete) distribution with P(z > 0.5) = prob."""
+    prob = prob.clamp(tiny, 1 - tiny)
+    u = torch.rand_like(prob).clamp(tiny, 1 - tiny)
+    return torch.sigmoid((prob.log() - (-prob).log1p() + u.log() - (-u).log1p()) / temperature)

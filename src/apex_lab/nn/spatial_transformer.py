@@ -1,0 +1,88 @@
+"""Spatial transformers for axis-aligned windows, as two matrix products (apex.md, section "Spatial transformers").
+
+A window is (s_y, s_x, t_y, t_x): size as a share of the image side and centre in [-1, 1]. Bilinear sampling of an
+axis-aligned window separates into one small matrix per axis with triangle weights, so a crop is `W_y F W_x^T` and a
+paste `W_y^T A W_x`. The result equals `affine_grid` + `grid_sample(align_corners=False, padding_mode="zeros")`, is
+deterministic on CUDA too, and needs no gather.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def pixel_centres(n: int, like: Tensor) -> Float[Tensor, "n"]:
+    """Centres of `n` pixels on the axis [-1, 1]."""
+    return (2 * torch.arange(n, device=like.device, dtype=like.dtype) + 1) / n - 1
+
+
+def _triangle(position: Float[Tensor, "... m"], n: int) -> Float[Tensor, "... m n"]:
+    """Bilinear weights of source pixels 0..n-1 at the fractional pixel positions."""
+    j = torch.arange(n, device=position.device, dtype=position.dtype)
+    return (1 - (position[..., None] - j).abs()).clamp_min(0)
+
+
+def crop_weights(
+    scale: Float[Tensor, "..."], centre: Float[Tensor, "..."], source: int, target: int
+) -> Float[Tensor, "... target source"]:
+    """One axis of a crop: row i holds the weights of the source pixels at target pixel i."""
+    at = centre[..., None] + scale[..., None] * pixel_centres(target, scale)
+    return _triangle((at + 1) * (source / 2) - 0.5, source)
+
+
+def paste_weights(
+    scale: Float[Tensor, "..."], centre: Float[Tensor, "..."], source: int, target: int
+) -> Float[Tensor, "... source target"]:
+    """One axis of a paste: column i holds the weights of the glimpse's pixels at image pixel i."""
+    at = (pixel_centres(target, scale) - centre[..., None]) / scale[..., None]
+    return _triangle((at + 1) * (source / 2) - 0.5, source).transpose(-1, -2)
+
+
+def crop(
+    image: Float[Tensor, "B C H W"], windows: Float[Tensor, "B K 4"], size: int
+) -> Float[Tensor, "B K C size size"]:
+    """Cuts K windows out of each image; zero where a window reaches beyond the image."""
+    s_y, s_x, t_y, t_x = windows.unbind(-1)
+    w_y = crop_weights(s_y, t_y, image.shape[-2], size)
+    w_x = crop_weights(s_x, t_x, image.shape[-1], size)
+    rows = torch.einsum("bkih,bchw->bkciw", w_y, image)
+    return rows @ w_x.transpose(-1, -2)[:, :, None]
+
+
+class Paster:
+    """Pastes glimpses of `glimpse` x `glimpse` pixels into images of `size` x `size`; zero outside the windows.
+
+    Holds the two matrices of every window so that several pastes through the same windows share them.
+
+    Args:
+        windows: (..., 4) windows with any leading shape.
+        glimpse: side of the glimpses in pixels.
+        size: side of the image in pixels.
+    """
+
+    def __init__(self, windows: Float[Tensor, "... 4"], glimpse: int, size: int) -> None:
+        s_y, s_x, t_y, t_x = windows.unbind(-1)
+        self.w_y = paste_weights(s_y, t_y, glimpse, size)
+        self.w_x = paste_weights(s_x, t_x, glimpse, size)
+
+    def each(self, glimpses: Float[Tensor, "... C g g"]) -> Float[Tensor, "... C size size"]:
+        """Every glimpse in an image of its own."""
+        return self.w_y.transpose(-1, -2).unsqueeze(-3) @ (glimpses @ self.w_x.unsqueeze(-3))
+
+    def total(self, glimpses: Float[Tensor, "... K g g"]) -> Float[Tensor, "... size size"]:
+        """All K glimpses summed in one image, without making the K images (`self` has windows (..., K, 4))."""
+        rows = glimpses @ self.w_x
+        return self.w_y.flatten(-3, -2).transpose(-1, -2) @ rows.flatten(-3, -2)
+
+    def inside(self) -> tuple[Float[Tensor, "... size"], Float[Tensor, "... size"]]:
+        """How far each image row and column lies inside the window, in [0, 1]: a pasted glimpse of ones, factorised."""
+        return self.w_y.sum(-2), self.w_x.sum(-2)
+
+
+def paste(
+    glimpses: Float[Tensor, "... C g g"], windows: Float[Tensor, "... 4"], size: int
+) -> Float[Tensor, "... C size size"]:
+    """Pastes each glimpse into an empty image through its window (the inverse of `crop`)."""
+    return Paster(windows, glimpses.shape[-1], size).each(glimpses)
