@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel, ConfigDict, Field
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from sims.camera import Camera
+from sims.objects import CATALOGUE
+
+Span = Annotated[tuple[float, float], Field(strict=False)]
+Names = Annotated[tuple[str, ...], Field(strict=False)]
 
 
 class Settings(BaseModel):
@@ -18,8 +26,42 @@ class Settings(BaseModel):
     val: int = Field(default=200, ge=0)
     test: int = Field(default=200, ge=0)
     frames: int = Field(default=20, ge=1)
+    """Frames per trajectory, spread evenly over the whole push, its first and last moment included."""
     image_size: int = Field(default=128, ge=16, le=1024)
     min_objects: int = Field(default=1, ge=1, le=14)
     max_objects: int = Field(default=3, ge=1, le=14)
     aim: float = Field(default=0.5, ge=0, le=1)
     """Share of lines drawn so that they meet an object."""
+    renderer: Literal["tiny", "egl"] = "tiny"
+    """'tiny' draws on the CPU, everywhere alike; 'egl' draws on a GPU, and its pictures differ."""
+    camera: Camera = Camera()
+    objects: Names = tuple(entry.name for entry in CATALOGUE)
+    """Classes to draw from, without repetition within a trajectory."""
+    objects_root: str | None = None
+    """Folder of textured models, one sub-folder per object with an OBJ and its PNG; None: the project's own textures."""
+    workspace_x: Span = (0.38, 0.66)
+    """Where objects are put and lines run, metres in front of the robot's base."""
+    workspace_y: Span = (-0.2, 0.2)
+    """Likewise to its left."""
+    height_m: float = Field(default=0.025, gt=0, le=0.2)
+    """Of the fingertips above the table."""
+    speed_m_s: float = Field(default=0.12, gt=0, le=0.5)
+    """Of the gripper along its line."""
+    max_redraws: int = Field(default=100, ge=0)
+    """Attempts at one trajectory before giving up with an error."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Settings:
+        if self.min_objects > self.max_objects:
+            raise ValueError(f"min_objects {self.min_objects} must not exceed max_objects {self.max_objects}")
+        if len(set(self.objects)) != len(self.objects):
+            raise ValueError(f"objects {list(self.objects)} names a class twice")
+        if len(self.objects) < self.max_objects:
+            raise ValueError(
+                f"max_objects {self.max_objects} needs as many classes in objects, which has {len(self.objects)}"
+            )
+        for key in ("workspace_x", "workspace_y"):
+            low, high = getattr(self, key)
+            if high - low < 0.1:
+                raise ValueError(f"{key} {(low, high)} must span at least 0.1 m, from low to high")
+        return self

@@ -1,0 +1,210 @@
+"""One pushing episode: physics first, then pictures and labels from the recorded poses alone."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from sims import arm as panda
+from sims.assets import ObjectModel, object_models
+from sims.errors import SimError
+from sims.p2d.settings import Settings
+from sims.p2d.spec import Spec, sample
+from sims.p2d.trajectory import Trajectory
+from sims.render import Renderer
+from sims.world import STEPS_PER_S, World
+
+SETTLE_S = 1.5
+REST_M_S, REST_RAD_S = 0.005, 0.05
+REST_STEPS = 24
+RAMP_S = 0.25
+WAYPOINT_M = 0.02
+IK_ERROR_M = 0.003
+START_GAP_M = 0.01
+
+
+class Unusable(Exception):
+    """This attempt makes no trajectory; draw another."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What physics gave, frame by frame: float32 arrays as in `Trajectory`, for the used slots only."""
+
+    poses: np.ndarray
+    joints: np.ndarray
+    gripper: np.ndarray
+    arm_contact: np.ndarray
+    object_contact: np.ndarray
+
+
+@lru_cache(maxsize=1)
+def _world(process: int) -> World:
+    return World()
+
+
+@lru_cache(maxsize=1)
+def _renderer(process: int, settings: Settings) -> Renderer:
+    return Renderer(settings.camera, settings.image_size, settings.renderer)
+
+
+def camera(settings: Settings) -> dict[str, object]:
+    """The camera as plain JSON data.
+
+    intrinsics 3 x 3 (pixels), extrinsics 4 x 4 (world to camera, OpenCV axes), near and far in metres, eye and target in
+    metres, fov in degrees (vertical), image_size in pixels.
+    """
+    view = settings.camera
+    return {
+        "intrinsics": view.intrinsics(settings.image_size).tolist(),
+        "extrinsics": view.extrinsics().tolist(),
+        "near": view.near_m,
+        "far": view.far_m,
+        "eye": list(view.eye),
+        "target": list(view.target),
+        "fov": view.fov_deg,
+        "image_size": settings.image_size,
+    }
+
+
+def simulate(settings: Settings, split: str, index: int) -> Trajectory:
+    """Make one trajectory; its bytes depend on the settings, the split's name and the index alone.
+
+    Raises:
+        SimError: PyBullet or a model is missing, or no attempt within `max_redraws` was usable.
+    """
+    models = object_models(settings.objects, settings.objects_root)
+    reasons: list[str] = []
+    for attempt in range(settings.max_redraws + 1):
+        spec = sample(settings, split, index, attempt)
+        try:
+            episode = push(settings, spec, models)
+        except Unusable as reason:
+            reasons.append(str(reason))
+            continue
+        return _label(settings, spec, episode, models)
+    raise SimError(
+        f"Trajectory {index} of split {split!r} (seed {settings.seed}) found no usable push in {len(reasons)} attempts, the "
+        f"last because {reasons[-1]}: check camera, workspace_x and workspace_y, or raise max_redraws."
+    )
+
+
+def push(settings: Settings, spec: Spec, models: tuple[ObjectModel, ...]) -> Episode:
+    """Run the physics of one attempt.
+
+    Raises:
+        Unusable: with the reason.
+    """
+    world = _world(os.getpid())
+    world.rebuild()
+    for placement in spec.objects:
+        world.add_object(models[placement.class_index], np.array(placement.position), np.array(placement.quaternion))
+    _settle(world)
+    world.add_arm()
+    path = _path(world, spec)
+    for body in world.objects:
+        if world.gap(body, START_GAP_M) < START_GAP_M:
+            raise Unusable("an object lay against the arm's start")
+    return _record(settings, world, path, models, spec)
+
+
+def _settle(world: World) -> None:
+    calm = 0
+    for _ in range(int(SETTLE_S * STEPS_PER_S)):
+        world.step()
+        linear, angular = world.speeds()
+        calm = calm + 1 if linear.max() < REST_M_S and angular.max() < REST_RAD_S else 0
+        if calm >= REST_STEPS:
+            return
+    raise Unusable("the objects did not come to rest")
+
+
+def _path(world: World, spec: Spec) -> np.ndarray:
+    """(N, 7) joint angles at evenly spaced points of the line."""
+    start, end = (np.array([*point, spec.height_m]) for point in (spec.start, spec.end))
+    count = max(2, int(np.ceil(np.linalg.norm(end - start) / WAYPOINT_M)) + 1)
+    points = start + np.linspace(0, 1, count)[:, None] * (end - start)
+    angles, error = panda.joint_path(world.bullet, world.arm, points, spec.yaw_rad)
+    if error > IK_ERROR_M:
+        raise Unusable("the arm does not reach the whole line")
+    return angles
+
+
+def progress(time_s: np.ndarray, duration_s: float) -> np.ndarray:
+    """Share of the line covered at a time: constant speed with a smooth start and stop of `RAMP_S` each."""
+    ramp = min(RAMP_S, duration_s / 3)
+    time_s = np.clip(time_s, 0, duration_s)
+    late = duration_s - time_s
+    top = 1 / (duration_s - ramp)
+    rising = top * time_s**2 / (2 * ramp)
+    falling = 1 - top * late**2 / (2 * ramp)
+    steady = top * (time_s - ramp / 2)
+    return np.where(time_s < ramp, rising, np.where(late < ramp, falling, steady))
+
+
+def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[ObjectModel, ...], spec: Spec) -> Episode:
+    length = float(np.linalg.norm(np.subtract(spec.end, spec.start)))
+    duration = length / settings.speed_m_s + RAMP_S
+    steps = int(np.ceil(duration * STEPS_PER_S))
+    share = progress(np.arange(steps + 2) / STEPS_PER_S, duration)
+    knots = np.linspace(0, 1, len(path))
+    angles = np.stack([np.interp(share, knots, path[:, joint]) for joint in range(7)], axis=1)
+    stops = np.round(np.linspace(0, steps, settings.frames)).astype(int)
+    count = len(spec.objects)
+    frames: list[tuple[np.ndarray, ...]] = []
+    arm_contact, object_contact = np.zeros(count, dtype=bool), np.zeros((count, count), dtype=bool)
+    step = 0
+    for stop in stops:
+        while step < stop:
+            world.drive(angles[step + 1], (angles[step + 1] - angles[step]) * STEPS_PER_S)
+            world.step()
+            touched, met = world.contacts()
+            arm_contact |= touched
+            object_contact |= met
+            step += 1
+        poses = world.poses()
+        _check(settings, poses, models, spec)
+        frames.append((poses, world.joints(), world.gripper(), arm_contact.copy(), object_contact.copy()))
+        arm_contact[:], object_contact[:] = False, False
+    poses, joints, gripper, arm, other = (np.stack(column) for column in zip(*frames, strict=True))
+    return Episode(poses.astype(np.float32), joints.astype(np.float32), gripper.astype(np.float32), arm, other)
+
+
+def _check(settings: Settings, poses: np.ndarray, models: tuple[ObjectModel, ...], spec: Spec) -> None:
+    if (poses[:, 2] < 0).any():
+        raise Unusable("an object left the table")
+    pixels, _ = settings.camera.project(poses[:, :3], settings.image_size)
+    if (pixels < 0.04 * settings.image_size).any() or (pixels > 0.96 * settings.image_size).any():
+        raise Unusable("an object left the picture")
+
+
+def _label(settings: Settings, spec: Spec, episode: Episode, models: tuple[ObjectModel, ...]) -> Trajectory:
+    """Draw every frame of an episode and pad the slots."""
+    renderer = _renderer(os.getpid(), settings)
+    renderer.show([models[placement.class_index] for placement in spec.objects])
+    used, slots = len(spec.objects), settings.max_objects
+    pictures, amodal = [], []
+    for joints, poses in zip(episode.joints, episode.poses, strict=True):
+        pictures.append(renderer.picture(joints, poses))
+        amodal.append(renderer.amodal_px(joints, poses))
+    segmentation = np.stack([picture.segmentation for picture in pictures])
+    visible = np.stack([(segmentation == 1 + part).sum(axis=(1, 2)) for part in range(slots + 1)], axis=1)
+    padded = slots - used
+    return Trajectory(
+        rgb=np.stack([picture.rgb for picture in pictures]),
+        segmentation=segmentation,
+        depth=np.stack([picture.depth for picture in pictures]).astype(np.float16),
+        classes=np.array([placement.class_index for placement in spec.objects] + [-1] * padded, dtype=np.int16),
+        poses=np.pad(episode.poses, ((0, 0), (0, padded), (0, 0)), constant_values=np.nan),
+        joints=episode.joints,
+        gripper=episode.gripper,
+        visible_px=visible.astype(np.int32),
+        amodal_px=np.pad(np.stack(amodal), ((0, 0), (0, padded))).astype(np.int32),
+        arm_contact=np.pad(episode.arm_contact, ((0, 0), (0, padded))),
+        object_contact=np.pad(episode.object_contact, ((0, 0), (0, padded), (0, padded))),
+        aimed=spec.aimed,
+        redraws=spec.attempt,
+    )

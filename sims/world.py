@@ -1,0 +1,133 @@
+"""A table with objects and an arm that obey physics; rebuilt from nothing for every episode."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sims import arm as panda
+from sims.assets import ObjectModel
+from sims.bullet import Client
+
+STEPS_PER_S = 240
+TABLE_LOW_M = (-0.25, -0.7)
+TABLE_HIGH_M = (1.0, 0.7)
+TABLE_THICKNESS_M = 0.04
+FLOOR_Z_M = -0.75
+
+
+class World:
+    """One physics server; `rebuild` empties it and sets the table, so that no episode knows of the one before."""
+
+    def __init__(self) -> None:
+        self.bullet = Client()
+        self.arm_urdf = str(panda.arm_model().physics)
+        self.arm = -1
+        self.table = -1
+        self.objects: list[int] = []
+
+    def rebuild(self) -> None:
+        """An empty table."""
+        bullet = self.bullet
+        bullet.call("resetSimulation")
+        bullet.call("setGravity", 0.0, 0.0, -9.81)
+        bullet.call(
+            "setPhysicsEngineParameter",
+            fixedTimeStep=1 / STEPS_PER_S,
+            numSolverIterations=50,
+            deterministicOverlappingPairs=1,
+        )
+        low, high = np.array(TABLE_LOW_M), np.array(TABLE_HIGH_M)
+        half = [*((high - low) / 2).tolist(), TABLE_THICKNESS_M / 2]
+        shape = bullet.call("createCollisionShape", bullet.module.GEOM_BOX, halfExtents=half)
+        place = [*((high + low) / 2).tolist(), -TABLE_THICKNESS_M / 2]
+        self.table = bullet.call("createMultiBody", 0.0, shape, -1, place)
+        bullet.call("changeDynamics", self.table, -1, lateralFriction=0.6, restitution=0.0)
+        self.arm, self.objects = -1, []
+
+    def add_object(self, model: ObjectModel, position: np.ndarray, quaternion: np.ndarray) -> int:
+        """Put an object at a pose of its frame (metres; x, y, z, w)."""
+        bullet = self.bullet
+        shape = bullet.call("createCollisionShape", bullet.module.GEOM_MESH, fileName=str(model.collision))
+        body = bullet.call("createMultiBody", model.mass_kg, shape, -1, position.tolist(), quaternion.tolist())
+        bullet.call(
+            "changeDynamics",
+            body,
+            -1,
+            lateralFriction=0.6,
+            spinningFriction=0.002,
+            rollingFriction=0.0005,
+            restitution=0.0,
+            linearDamping=0.04,
+            angularDamping=0.1,
+        )
+        self.objects.append(body)
+        return int(body)
+
+    def add_arm(self) -> int:
+        """Load the arm with its base at the origin."""
+        self.arm = self.bullet.call("loadURDF", self.arm_urdf, [0, 0, 0], useFixedBase=True)
+        for joint in range(self.bullet.call("getNumJoints", self.arm)):
+            self.bullet.call("changeDynamics", self.arm, joint, lateralFriction=0.5, restitution=0.0)
+        return int(self.arm)
+
+    def drive(self, angles: np.ndarray, speeds: np.ndarray) -> None:
+        """Set the position motors' targets: joint angles (7,) and speeds (7,); the fingers stay closed."""
+        self.bullet.call(
+            "setJointMotorControlArray",
+            self.arm,
+            panda.JOINTS,
+            self.bullet.module.POSITION_CONTROL,
+            targetPositions=[*angles.tolist(), 0.0, 0.0],
+            targetVelocities=[*speeds.tolist(), 0.0, 0.0],
+            forces=panda.FORCE_N,
+            positionGains=[0.3] * 9,
+            velocityGains=[1.0] * 9,
+        )
+
+    def step(self) -> None:
+        """Advance by 1 / `STEPS_PER_S` seconds."""
+        self.bullet.call("stepSimulation")
+
+    def poses(self) -> np.ndarray:
+        """(O, 7) x, y, z in metres and quaternion x, y, z, w of every object's frame."""
+        states = [self.bullet.call("getBasePositionAndOrientation", body) for body in self.objects]
+        return np.array([[*position, *quaternion] for position, quaternion in states])
+
+    def speeds(self) -> tuple[np.ndarray, np.ndarray]:
+        """(O,) metres per second and (O,) radians per second of every object."""
+        states = [self.bullet.call("getBaseVelocity", body) for body in self.objects]
+        return (
+            np.array([np.linalg.norm(linear) for linear, _ in states]),
+            np.array([np.linalg.norm(angular) for _, angular in states]),
+        )
+
+    def joints(self) -> np.ndarray:
+        """(9,) joint angles in radians, finger positions in metres."""
+        return np.array([state[0] for state in self.bullet.call("getJointStates", self.arm, panda.JOINTS)])
+
+    def gripper(self) -> np.ndarray:
+        """(7,) pose of the point between the fingertips."""
+        state = self.bullet.call("getLinkState", self.arm, panda.GRASP_LINK, computeForwardKinematics=True)
+        return np.array([*state[4], *state[5]])
+
+    def gap(self, body: int, reach_m: float) -> float:
+        """Smallest distance in metres between the arm and a body, `inf` when it is beyond `reach_m`."""
+        points = self.bullet.call("getClosestPoints", self.arm, body, reach_m)
+        return min((point[8] for point in points), default=np.inf)
+
+    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
+        """Who touches whom now: arm-object (O,) and object-object (O, O) flags."""
+        count = len(self.objects)
+        slot = {body: i for i, body in enumerate(self.objects)}
+        arm_contact = np.zeros(count, dtype=bool)
+        object_contact = np.zeros((count, count), dtype=bool)
+        for i, body in enumerate(self.objects):
+            for point in self.bullet.call("getContactPoints", body):
+                if point[8] > 0.0005:
+                    continue
+                other = point[2] if point[1] == body else point[1]
+                if other == self.arm:
+                    arm_contact[i] = True
+                elif other in slot:
+                    object_contact[i, slot[other]] = object_contact[slot[other], i] = True
+        return arm_contact, object_contact
