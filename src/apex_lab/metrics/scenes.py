@@ -1,0 +1,49 @@
+"""From a `Scene` to what the metrics read: one identity per pixel."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from apex_lab.scene import ABSENT, Scene
+
+
+def scene_identities(
+    scene: Scene, size: tuple[int, int] | None = None, min_presence: float = 0.5
+) -> Int[Tensor, "B T H W"]:
+    """Identity of the winning component at every pixel, in the resolution of the ground truth.
+
+    Args:
+        scene: what a model says.
+        size: (H, W) of the ground truth; soft masks of another size are resized before the argmax
+            (metrics.md section 0). None keeps the masks' own size.
+        min_presence: objects below it are taken out before the argmax (metrics.md section 2.4).
+
+    Raises:
+        ValueError: a pixel was won by a component without an identity.
+    """
+    if size is not None and tuple(size) != tuple(scene.masks.shape[-2:]):
+        scene = dataclasses.replace(
+            scene,
+            masks=resize_masks(scene.masks, size),
+            reconstruction=scene.reconstruction.new_zeros(()).expand(*scene.reconstruction.shape[:3], *size),
+            means=None,
+        )
+    # Scene.segmentation passes over components without identity; that they had nothing to win is checked here.
+    winner = scene.masks.float().argmax(dim=2)
+    nameless = scene.ids.gather(2, winner.flatten(2)) == ABSENT
+    if bool(nameless.any()):
+        raise ValueError(
+            f"{float(nameless.double().mean()):.2%} of the pixels were won by a component without an identity "
+            f"(id {ABSENT}): a model must give an absent component a zero mask, and a background component an id"
+        )
+    return scene.segmentation(min_presence)
+
+
+def resize_masks(masks: Float[Tensor, "B T K H W"], size: tuple[int, int]) -> Float[Tensor, "B T K H2 W2"]:
+    """Soft masks in another resolution, bilinearly (they still sum to 1 over K)."""
+    resized = F.interpolate(masks.flatten(0, 1).float(), size=size, mode="bilinear", align_corners=False)
+    return resized.unflatten(0, masks.shape[:2])
