@@ -21,13 +21,15 @@ class Glimpses(nn.Module, ABC):
     """Cuts windows out of its source and encodes them, with one CNN for glimpses and one for propagation crops.
 
     Args:
-        size: side of a crop in pixels of the source.
+        size: side of a crop in pixels of a feature map; crops of the image have twice as many.
         width: channels of the two CNNs.
     """
 
+    pixels_per_size = 1
+
     def __init__(self, size: Size, width: Count) -> None:
         super().__init__()
-        self.size, self.width = size, width
+        self.size, self.width = size * self.pixels_per_size, width
 
     def build(self, features: int, code: int) -> None:
         """Makes the CNNs; called once by the model, which knows F and the length of a code."""
@@ -73,6 +75,8 @@ class FeatureGlimpses(Glimpses):
 
 class ImageGlimpses(Glimpses):
     """From the image x_t; a propagation crop also sees the previous frame, since motion is what it is for."""
+
+    pixels_per_size = 2
 
     def channels(self, features: int) -> tuple[int, int]:
         """RGB; RGB of two frames."""

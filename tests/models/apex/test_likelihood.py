@@ -1,0 +1,77 @@
+"""Likelihoods against brute-force sums in float64."""
+
+import math
+
+import pytest
+import torch
+
+from apex_lab.models.apex.likelihood import GaussianLikelihood, MixtureLikelihood
+
+
+def case(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
+    g = torch.Generator().manual_seed(0)
+    n, k, h, w = 2, 3, 4, 5
+    share = torch.rand(n, k + 1, h, w, generator=g, dtype=torch.float64)
+    share[:, 1] = 0  # an absent component
+    logs = (share / share.sum(1, keepdim=True)).log()
+    image = torch.rand(n, 3, h, w, generator=g, dtype=torch.float64)
+    means = torch.rand(n, k, 3, h, w, generator=g, dtype=torch.float64)
+    background = torch.rand(n, 3, h, w, generator=g, dtype=torch.float64)
+    return tuple(x.to(dtype) for x in (image, logs[:, :k], means, logs[:, k], background))
+
+
+def density(x: float, mean: float, sigma: float) -> float:
+    return math.exp(-0.5 * ((x - mean) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi))
+
+
+@pytest.mark.parametrize("over", ["channel", "pixel"])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-5)])
+def test_mixture_against_a_loop(over: str, dtype: torch.dtype, tolerance: float) -> None:
+    fg, bg = 0.4, 0.2
+    image, log_objects, means, log_background, background = case()
+    want = torch.zeros(2, dtype=torch.float64)
+    for n in range(2):
+        for y in range(4):
+            for x in range(5):
+                p = []
+                for channel in range(3):
+                    value = image[n, channel, y, x].item()
+                    parts = [
+                        (log_objects[n, k, y, x].exp().item(), density(value, means[n, k, channel, y, x].item(), fg))
+                        for k in range(3)
+                    ]
+                    back = density(value, background[n, channel, y, x].item(), bg)
+                    p.append([*parts, (log_background[n, y, x].exp().item(), back)])
+                if over == "channel":
+                    want[n] += sum(math.log(sum(m * d for m, d in row)) for row in p)
+                else:
+                    whole = zip(*p, strict=True)
+                    want[n] += math.log(sum(rgb[0][0] * math.prod(d for _, d in rgb) for rgb in whole))
+    got = MixtureLikelihood(fg, bg, over)(*case(dtype))  # type: ignore[arg-type]
+    torch.testing.assert_close(got.double(), want, rtol=tolerance, atol=0)
+
+
+def test_mixture_is_stable_far_from_every_mean() -> None:
+    image, log_objects, means, log_background, background = case(torch.float32)
+    image = (image + 50).requires_grad_()
+    out = MixtureLikelihood()(image, log_objects, means, log_background, background)
+    out.sum().backward()
+    assert out.isfinite().all()
+    assert image.grad is not None
+    assert image.grad.isfinite().all()
+
+
+def test_gaussian_against_torch() -> None:
+    image, log_objects, means, log_background, background = case()
+    blend = (log_objects.exp()[:, :, None] * means).sum(1) + log_background.exp()[:, None] * background
+    want = torch.distributions.Normal(blend, 0.3).log_prob(image).sum((1, 2, 3))
+    torch.testing.assert_close(GaussianLikelihood(0.3)(*case()), want)
+
+
+def test_both_agree_where_one_component_owns_every_pixel() -> None:
+    image, _, means, _, background = case()
+    logs = torch.full((2, 3, 4, 5), -torch.inf, dtype=torch.float64)
+    only_background = torch.zeros(2, 4, 5, dtype=torch.float64)
+    a = MixtureLikelihood(0.1, 0.2)(image, logs, means, only_background, background)
+    b = GaussianLikelihood(0.2)(image, logs, means, only_background, background)
+    torch.testing.assert_close(a, b)

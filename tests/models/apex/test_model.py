@@ -1,0 +1,335 @@
+"""The whole model on tiny videos: shapes, independence, identities, gradients, reproducibility, tracking."""
+
+import pytest
+import torch
+
+from apex_lab.models.apex import (
+    Apex,
+    ApexEncoder,
+    ApexNormalisation,
+    Background,
+    FeatureGlimpses,
+    GaussianLikelihood,
+    ImageGlimpses,
+    MixtureLikelihood,
+    ScalorNormalisation,
+)
+from apex_lab.models.apex.objective import DiscoveryPrior
+from apex_lab.models.apex.objects import Objects, Propagation
+from apex_lab.models.apex.windows import Windows, window_of
+from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.spatial_transformer import Paster, pixel_centres
+from apex_lab.scene import Scene, schedule_at
+
+SCHEDULE = schedule_at({"temperature": 0.7, "discovery_presence": 0.1})
+
+
+def tiny(**changes: object) -> Apex:
+    """APEX with every part at its smallest; random weights spread so that all presences occur."""
+    torch.manual_seed(0)
+    parts: dict = {
+        "encoder": ApexEncoder(8, (4, 4, 6, 8, 8, 8), (1, 1, 1, 1)),
+        "glimpses": FeatureGlimpses(4, 6),
+        "masks": ApexNormalisation(),
+        "likelihood": MixtureLikelihood(),
+        "background": Background(32, 6, 6),
+        "discovery_prior": DiscoveryPrior(),
+        "what": 6,
+        "hidden": 12,
+        "grid": 4,
+        "max_objects": 3,
+        "render_top": 4,
+        "glimpse_size": 8,
+        "decoder_width": 4,
+        "start_presence": 0.5,
+    }
+    model = Apex(32, **(parts | changes))
+    with torch.no_grad():
+        for p in model.discovery.head_pres.parameters():
+            p.mul_(20.0)
+    return model
+
+
+def video(b: int = 3, t: int = 4) -> torch.Tensor:
+    return torch.rand(b, t, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+
+
+def check_scene(scene: Scene, b: int, t: int, slots: int) -> None:
+    k = slots + 1
+    assert scene.masks.shape == (b, t, k, 32, 32)
+    assert (scene.masks >= 0).all()
+    assert (scene.masks.sum(2) - 1).abs().max() <= 1e-6
+    assert scene.background.tolist() == [False] * slots + [True]
+    assert scene.ids.shape == scene.presence.shape == (b, t, k)
+    assert ((scene.ids == -1) == (scene.presence == 0)).all()
+    assert (scene.masks[scene.ids == -1] == 0).all()
+    assert scene.reconstruction.shape == (b, t, 3, 32, 32)
+    assert all(v.shape == (b,) and v.isfinite().all() for v in scene.terms.values())
+    for i in range(b):
+        for j in range(t):
+            ids = [x for x in scene.ids[i, j].tolist() if x != -1]
+            assert len(ids) == len(set(ids))
+
+
+@pytest.mark.parametrize("training", [True, False])
+def test_scene_keeps_the_contract(training: bool) -> None:
+    model = tiny().train(training)
+    scene = model(video(), SCHEDULE)
+    check_scene(scene, 3, 4, 3)
+    assert set(scene.terms) == set(model.term_names)
+    assert (scene.ids[:, :, :3] >= 0).any()
+
+
+def test_an_identity_never_comes_back() -> None:
+    model = tiny().train()
+    reappeared = vanished = 0
+    for seed in range(10):
+        torch.manual_seed(seed)
+        ids = model(video(3, 6), SCHEDULE).ids[..., :3]
+        for b in range(3):
+            frames = [set(ids[b, t].tolist()) - {-1} for t in range(6)]
+            for identity in set().union(*frames):
+                seen = [identity in f for f in frames]
+                first, last = seen.index(True), 5 - seen[::-1].index(True)
+                vanished += last < 5
+                reappeared += not all(seen[first : last + 1])
+    assert reappeared == 0
+    assert vanished > 0
+
+
+def test_a_video_does_not_depend_on_the_rest_of_its_batch() -> None:
+    model = tiny().eval()
+    x = video()
+    together = model(x, SCHEDULE)
+    for i in range(3):
+        alone = model(x[i : i + 1], SCHEDULE)
+        torch.testing.assert_close(alone.masks[0], together.masks[i], rtol=1e-4, atol=1e-5)
+        assert torch.equal(alone.ids[0], together.ids[i])
+        for name in alone.terms:
+            torch.testing.assert_close(alone.terms[name][0], together.terms[name][i], rtol=1e-4, atol=1e-2)
+
+
+def test_no_video_influences_the_gradient_of_another() -> None:
+    model = tiny().eval()
+    x = video().requires_grad_()
+    model(x, SCHEDULE).terms["nll"][0].backward()
+    assert x.grad is not None
+    assert x.grad[0].abs().sum() > 0
+    assert (x.grad[1:] == 0).all()
+
+
+def test_the_future_does_not_change_the_past() -> None:
+    model = tiny().eval()
+    x = video()
+    y = x.clone()
+    y[:, 3] = 1 - y[:, 3]
+    a, b = model(x, SCHEDULE), model(y, SCHEDULE)
+    torch.testing.assert_close(a.masks[:, :3], b.masks[:, :3], rtol=1e-4, atol=1e-5)
+
+
+def test_permuting_components_permutes_masks_and_leaves_the_likelihood() -> None:
+    torch.manual_seed(3)
+    order = torch.tensor([2, 0, 3, 1])
+    alpha, presence = 3 * torch.randn(2, 4, 8, 8), torch.rand(2, 4)
+    windows = torch.cat([0.2 + 0.5 * torch.rand(2, 4, 2), torch.rand(2, 4, 2) - 0.5], -1)
+    valid = torch.tensor([[True, True, False, True]] * 2)
+    means, image, back = torch.rand(2, 4, 3, 16, 16), torch.rand(2, 3, 16, 16), torch.rand(2, 3, 16, 16)
+    for masks in (ApexNormalisation(), ScalorNormalisation()):
+        a = masks.compose(alpha, presence, valid, Paster(windows, 8, 16))
+        b = masks.compose(alpha[:, order], presence[:, order], valid[:, order], Paster(windows[:, order], 8, 16))
+        torch.testing.assert_close(a.objects[:, order], b.objects)
+        torch.testing.assert_close(a.background, b.background)
+        for likelihood in (MixtureLikelihood(), GaussianLikelihood()):
+            first = likelihood(image, a.log_objects, means, a.log_background, back)
+            torch.testing.assert_close(first, likelihood(image, b.log_objects, means[:, order], b.log_background, back))
+
+
+def test_permuting_slots_permutes_propagation() -> None:
+    model = tiny().eval()
+    torch.manual_seed(4)
+    order = torch.tensor([2, 0, 1])
+    state = Objects(
+        torch.randn(1, 3, 6), torch.rand(1, 3, 4) - 0.5, torch.rand(1, 3), *(torch.randn(1, 3, 12) for _ in range(4))
+    )
+    e = torch.randn(1, 8, 8, 8)
+    valid = torch.tensor([[True, True, False]])
+
+    def propagate(state: Objects, valid: torch.Tensor) -> Objects:
+        t = SCHEDULE["temperature"]
+        return model.propagation(state, model.glimpses, model.appearance, e, e, valid, t, False)[0]
+
+    a, b = propagate(state, valid), propagate(Objects(*(x[:, order] for x in state)), valid[:, order])
+    for x, y in zip(a, b, strict=True):
+        torch.testing.assert_close(x[:, order], y)
+
+
+def test_gradients_reach_every_parameter() -> None:
+    model = tiny().train()
+    torch.manual_seed(5)
+    sum(model(video(), SCHEDULE).terms.values()).sum().backward()
+    missing = [n for n, p in model.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
+    assert missing == []
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
+
+
+@pytest.mark.parametrize("logit", [-30.0, 30.0])
+@pytest.mark.parametrize("size", [-30.0, 30.0])
+def test_gradients_stay_finite_with_all_or_no_objects_and_extreme_windows(logit: float, size: float) -> None:
+    model = tiny().train()
+    with torch.no_grad():
+        model.discovery.head_pres[-1].weight.zero_()
+        model.discovery.head_pres[-1].bias.fill_(logit)
+        model.discovery.head_where.bias[:2] = size
+    scene = model(video(), SCHEDULE)
+    assert ((scene.ids[:, 0, :3] >= 0).all() if logit > 0 else (scene.ids[:, :, :3] == -1).all())
+    sum(scene.terms.values()).sum().backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
+
+
+def test_the_same_seed_gives_the_same_losses() -> None:
+    def losses() -> list[float]:
+        model = tiny().train()
+        optimiser = torch.optim.Adam(model.parameters(), lr=1e-3)
+        values = []
+        for step in range(4):
+            torch.manual_seed(step)
+            loss = sum(model(video(), SCHEDULE).terms.values()).mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            values.append(loss.item())
+        return values
+
+    first = losses()
+    assert first == losses()
+    assert len(set(first)) == 4
+
+
+class IdealWhere(torch.nn.Module):
+    """Stands in for the recurrent z_where network: knows the square's true motion of 2 px per frame to the right."""
+
+    def __init__(self, change: float, step: float) -> None:
+        super().__init__()
+        self.raw = torch.atanh(torch.tensor(change / step))
+
+    def forward(self, hidden: torch.Tensor) -> torch.Tensor:
+        raw = torch.zeros(*hidden.shape[:-1], 8)
+        raw[..., 3] = self.raw
+        return raw
+
+
+def test_propagation_alone_tracks_a_moving_square_exactly() -> None:
+    """Discovery is off; with ideal latents each frame's mask is the square that moved 2 px."""
+    torch.manual_seed(0)
+    size, step = 32, 0.2
+    windows = Windows(4, 1.5, 0.3, step)
+    model = tiny()
+    propagation = Propagation(12, 6, 12, windows)
+    propagation.head_where = IdealWhere(2 * 2 / size, step)  # type: ignore[assignment]
+    with torch.no_grad():
+        propagation.head_pres[-1].bias.fill_(20.0)
+    half = torch.logit(torch.tensor(0.25))
+    place = torch.stack([half, half, torch.tensor(0.0), torch.tensor(-0.5)])[None, None]
+    state = Objects(
+        torch.randn(1, 1, 6), place, torch.ones(1, 1), *(torch.zeros(1, 1, 12) for _ in range(4))
+    )
+    solid = torch.full((1, 1, 8, 8), 5.0)
+    masks = ApexNormalisation()
+    centres = pixel_centres(size, torch.zeros(()))
+    e = torch.randn(1, 8, 8, 8)
+    valid = torch.ones(1, 1, dtype=torch.bool)
+    for t in range(1, 6):
+        state, _ = propagation(
+            state, model.glimpses, model.appearance, e, e, valid, SCHEDULE["temperature"], False
+        )
+        composed = masks.compose(solid, state.presence, valid, Paster(window_of(state.place), 8, size))
+        truth = (centres.abs() < 0.25)[:, None] & ((centres - (-0.5 + t * 4 / size)).abs() < 0.25)[None]
+        assert torch.equal(composed.objects[0, 0] > 0.5, truth)
+
+
+def test_z_what_zero_gives_discovery_and_propagation_the_same_appearance() -> None:
+    """Discovery infers z_what with the same networks as propagation, from z_what_0 = 0."""
+    model = tiny().eval()
+    e = torch.randn(1, 1, 8, 8, 8)
+    proposals = model.discovery(e, e, model.glimpses, model.appearance, False)
+    code = model.glimpses.look(e[:, 0], window_of(proposals.place[:, 0])).flatten(0, 1)
+    q, _ = model.appearance(code, torch.zeros(16, 6), torch.zeros(16, 12))
+    torch.testing.assert_close(proposals.q_what.mean[0, 0], q.mean)
+    assert isinstance(q, Gaussian)
+
+
+def test_ablations_change_their_part_only() -> None:
+    x, base = video(), tiny()
+    variants = {
+        "image_stn": tiny(glimpses=ImageGlimpses(4, 6)),
+        "scalor_norm": tiny(masks=ScalorNormalisation()),
+        "gaussian": tiny(likelihood=GaussianLikelihood()),
+        "gaussian_scalor_norm": tiny(likelihood=GaussianLikelihood(), masks=ScalorNormalisation()),
+    }
+    weights = base.state_dict()
+    for name, model in variants.items():
+        own = model.state_dict()
+        if name != "image_stn":
+            assert own.keys() == weights.keys()
+        shared = [k for k in weights if not k.startswith("glimpses.")]
+        model.load_state_dict({k: weights[k] for k in shared}, strict=False)
+        assert all(own[k].shape == weights[k].shape for k in shared)
+    outputs = {name: model.eval()(x, SCHEDULE) for name, model in variants.items()}
+    reference = base.eval()(x, SCHEDULE)
+    same = outputs["gaussian"]
+    torch.testing.assert_close(same.masks, reference.masks)
+    assert all(torch.equal(same.terms[k], reference.terms[k]) for k in reference.terms if k != "nll")
+    assert not torch.equal(same.terms["nll"], reference.terms["nll"])
+    for name in ("scalor_norm", "image_stn"):
+        assert not torch.allclose(outputs[name].reconstruction, reference.reconstruction)
+    both, norm = outputs["gaussian_scalor_norm"], outputs["scalor_norm"]
+    torch.testing.assert_close(both.masks, norm.masks)
+    assert not torch.equal(both.terms["nll"], norm.terms["nll"])
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        {"glimpses": ImageGlimpses(4, 6)},
+        {"masks": ScalorNormalisation()},
+        {"likelihood": GaussianLikelihood(), "masks": ScalorNormalisation()},
+        {"render_top": None},
+        {"background": Background(32, 6, 6, "none")},
+        {"kl": "exclusive"},
+    ],
+)
+def test_every_variant_trains_a_step(part: dict) -> None:
+    model = tiny(**part).train()
+    scene = model(video(), SCHEDULE)
+    check_scene(scene, 3, 4, 3)
+    sum(scene.terms.values()).sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
+
+
+def test_the_background_starts_at_the_median() -> None:
+    median = torch.rand(3, 32, 32) * 0.9 + 0.05
+    model = tiny()
+    model.initialise(median)
+    picture = model.background.decode(torch.zeros(1, 6))[0]
+    assert (picture - median).abs().max() < 0.06
+    plain = tiny(background=Background(32, 6, 6, "none"))
+    plain.initialise(median)
+    assert plain.background.bias_image is None
+
+
+def test_refusals() -> None:
+    with pytest.raises(ValueError, match=r"model\.image_size=48"):
+        Apex(48, **{k: v for k, v in tiny_parts().items()})
+    with pytest.raises(ValueError, match="built for 32 px"):
+        tiny()(torch.rand(1, 2, 3, 64, 64), SCHEDULE)
+
+
+def tiny_parts() -> dict:
+    return {
+        "encoder": ApexEncoder(8, (4, 4, 6, 8, 8, 8), (1, 1, 1, 1)),
+        "glimpses": FeatureGlimpses(4, 6),
+        "masks": ApexNormalisation(),
+        "likelihood": MixtureLikelihood(),
+        "background": Background(32, 6, 6),
+        "discovery_prior": DiscoveryPrior(),
+    }

@@ -1,0 +1,65 @@
+"""Shapes, causality and start values of the shared networks."""
+
+import pytest
+import torch
+
+from apex_lab.nn.blocks import BroadcastDecoder, GlimpseEncoder, SubpixelDecoder, group_norm
+from apex_lab.nn.conv_lstm import ConvLSTM
+from apex_lab.nn.dla import DLA, UpSample
+
+
+def test_dla_has_stride_four_and_uses_every_parameter() -> None:
+    net = DLA(12, (4, 6, 8, 10, 12, 14), (1, 2, 2, 1))
+    out = net(torch.randn(2, 3, 64, 64))
+    assert out.shape == (2, 12, 16, 16)
+    out.square().sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in net.parameters())
+
+
+def test_dla_refuses_wrong_depths() -> None:
+    with pytest.raises(ValueError, match="6 widths and 4 depths"):
+        DLA(12, (4, 6, 8), (1, 1, 1, 1))
+
+
+def test_upsample_starts_as_bilinear_interpolation() -> None:
+    x = torch.randn(1, 3, 6, 6)
+    got = UpSample(3)(x)
+    want = torch.nn.functional.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+    torch.testing.assert_close(got[..., 1:-1, 1:-1], want[..., 1:-1, 1:-1], rtol=0, atol=1e-6)
+
+
+def test_conv_lstm_against_the_cell_equations() -> None:
+    torch.manual_seed(0)
+    net = ConvLSTM(3).double()
+    x = torch.randn(2, 4, 3, 5, 5, dtype=torch.float64)
+    h = c = torch.zeros(2, 3, 5, 5, dtype=torch.float64)
+    for t in range(4):
+        i, f, o, g = (net.from_input(x[:, t]) + net.from_hidden(h)).chunk(4, 1)
+        c = f.sigmoid() * c + i.sigmoid() * g.tanh()
+        h = o.sigmoid() * c.tanh()
+        torch.testing.assert_close(net(x)[:, t], h)
+
+
+def test_conv_lstm_sees_no_future() -> None:
+    net = ConvLSTM(3)
+    x = torch.randn(1, 4, 3, 5, 5)
+    y = x.clone()
+    y[:, 3] += 1
+    torch.testing.assert_close(net(x)[:, :3], net(y)[:, :3])
+
+
+@pytest.mark.parametrize("size", [8, 16, 32, 64])
+def test_subpixel_decoder_size(size: int) -> None:
+    assert SubpixelDecoder(5, size, 4, 3)(torch.randn(2, 5)).shape == (2, 3, size, size)
+
+
+@pytest.mark.parametrize("size", [4, 12, 20])
+def test_subpixel_decoder_refuses_other_sizes(size: int) -> None:
+    with pytest.raises(ValueError, match="4 times a power of two"):
+        SubpixelDecoder(5, size, 4, 3)
+
+
+def test_broadcast_decoder_and_glimpse_encoder_sizes() -> None:
+    assert BroadcastDecoder(5, 32, 8, 3)(torch.randn(2, 5)).shape == (2, 3, 32, 32)
+    assert GlimpseEncoder(6, 12, 8, 10)(torch.randn(2, 6, 12, 12)).shape == (2, 10)
+    assert group_norm(30)(torch.randn(1, 30, 2, 2)).shape == (1, 30, 2, 2)
