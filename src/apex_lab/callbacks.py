@@ -1,0 +1,162 @@
+"""What happens beside training: checkpoints and the display of progress."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from typing import Annotated, Any, Literal
+
+import lightning as L
+from pydantic import Field
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as Bar
+
+from apex_lab import checkpoints, console
+from apex_lab.learner import Learner
+from apex_lab.runs import Run
+
+
+class Checkpoints(L.Callback):
+    """Keeps last.ckpt (to go on from), the one before it, and best.ckpt (highest or lowest validation score).
+
+    A step at which validation is due is stored after validation, so that going on from it repeats or misses none.
+
+    Args:
+        run: whose folder the files lie in.
+        interval: steps between two checkpoints; what a kill can cost.
+        validation_interval: steps between validations; None for none.
+        max_steps: the last step, always stored.
+        monitor: name of the validation score.
+        mode: which end of it is best.
+        training: `training` entry of the checkpoint that this run goes on from.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        interval: int,
+        validation_interval: int | None,
+        max_steps: int,
+        monitor: str,
+        mode: Literal["max", "min"],
+        training: dict[str, Any] | None = None,
+    ) -> None:
+        self._run = run
+        self._interval = interval
+        self._validation_interval = validation_interval
+        self._max_steps = max_steps
+        self._monitor = monitor
+        self._sign = 1.0 if mode == "max" else -1.0
+        self._best: float | None = training["best"] if training else None
+        self._seconds_before: float = training["seconds"] if training else 0.0
+        self._start = time.monotonic()
+
+    def on_train_start(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
+        self._start = time.monotonic()
+
+    def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
+        assert isinstance(learner, Learner)
+        if learner.step % self._interval == 0 and not self._validation_due(learner.step):
+            self._save_last(learner)
+
+    def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
+        assert isinstance(learner, Learner)
+        score = trainer.callback_metrics.get(self._monitor)
+        value = math.nan if score is None else float(score)
+        if math.isfinite(value) and (self._best is None or self._sign * value > self._sign * self._best):
+            self._best = value
+            checkpoints.save(self._run.best, {**self._content(learner), "training": None})
+        self._save_last(learner)
+
+    def on_train_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
+        assert isinstance(learner, Learner)
+        if not self._validation_due(learner.step):
+            self._save_last(learner)
+
+    def _validation_due(self, step: int) -> bool:
+        interval = self._validation_interval
+        return interval is not None and (step % interval == 0 or step == self._max_steps)
+
+    def _content(self, learner: Learner) -> dict[str, Any]:
+        job = self._run.job
+        return {
+            "step": learner.step,
+            "weights": {name: value.detach().cpu() for name, value in learner.model.state_dict().items()},
+            "config": job.raw,
+            "choices": job.choices,
+        }
+
+    def _save_last(self, learner: Learner) -> None:
+        learner.fetch()  # weights that are not finite are never stored
+        optimizer = learner.optimizers()
+        assert not isinstance(optimizer, list)
+        seconds = self._seconds_before + time.monotonic() - self._start
+        training = {
+            "optimizer": optimizer.state_dict(),
+            "best": self._best,
+            "seconds": seconds,
+            "data_fingerprint": self._run.record["data_fingerprint"],
+        }
+        checkpoints.save(self._run.last, {**self._content(learner), "training": training}, keep_previous=True)
+        self._run.update(steps=learner.step, seconds=round(seconds, 1))
+
+
+class Progress(L.Callback):
+    """A bar with the time left on a terminal; elsewhere a line now and then.
+
+    Args:
+        seconds: between two lines where there is no terminal.
+    """
+
+    def __init__(self, seconds: Annotated[float, Field(gt=0)] = 15.0) -> None:
+        self._seconds = seconds
+        self._bar: Bar | None = None
+        self._task: TaskID | None = None
+        self._last = self._start = 0.0
+        self._first_step = 0
+        self._total = 0
+
+    def on_train_start(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
+        assert isinstance(learner, Learner)
+        self._first_step = learner.step
+        self._total = learner.step + trainer.max_steps
+        self._start = self._last = time.monotonic()
+        if sys.stderr.isatty():
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            self._bar = Bar(*columns, TextColumn("{task.fields[score]}"))
+            self._task = self._bar.add_task("training", total=self._total, completed=learner.step, score="")
+            self._bar.start()
+
+    def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
+        assert isinstance(learner, Learner)
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, completed=learner.step)
+        elif time.monotonic() - self._last >= self._seconds:
+            self._last = time.monotonic()
+            left = (self._last - self._start) / (learner.step - self._first_step) * (self._total - learner.step)
+            loss = float(learner.latest["train/loss"])
+            console.say(f"step {learner.step} of {self._total}, loss {loss:.1f}, {readable(left)} left")
+
+    def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
+        assert isinstance(learner, Learner)
+        names = {"val/ari_fg": "ARI-FG", "val/ari": "ARI", "val/msc": "MSC"}
+        metrics = trainer.callback_metrics
+        score = ", ".join(f"{short} {float(metrics[name]):.3f}" for name, short in names.items() if name in metrics)
+        if self._bar is not None and self._task is not None:
+            self._bar.update(self._task, score=score)
+        else:
+            console.say(f"step {learner.step} of {self._total}, validation: {score}")
+
+    def teardown(self, trainer: L.Trainer, learner: L.LightningModule, stage: str) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+def readable(seconds: float) -> str:
+    """A duration in the unit a person would use."""
+    for size, unit in ((86400.0, "days"), (3600.0, "hours"), (60.0, "minutes")):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}" if seconds < 10 * size else f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} seconds"

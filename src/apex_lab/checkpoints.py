@@ -1,0 +1,87 @@
+"""Checkpoint files: weights with the configuration that built the model, and what training needs to go on.
+
+A checkpoint is a dictionary of plain values and tensors, readable with `torch.load(path, weights_only=True)`:
+
+    format    version of this layout
+    step      weight updates made
+    weights   the model's state_dict
+    config    resolved configuration (plain containers)
+    choices   configuration group -> word chosen
+    training  optimiser state, seconds so far, best score, data's fingerprint; None where only evaluation is meant
+"""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from apex_lab.errors import UserError
+from apex_lab.files import replacing, unwritable
+
+FORMAT = 1
+_KEYS = {"format", "step", "weights", "config", "choices", "training"}
+
+
+def save(path: Path, checkpoint: dict[str, Any], keep_previous: bool = False) -> None:
+    """Writes a checkpoint; until all of it is on the disk, the file that was there before stays.
+
+    Args:
+        path: where to.
+        checkpoint: the entries of the module's docstring, without `format`.
+        keep_previous: leaves the file that was there before beside the new one, as `previous(path)`.
+
+    Raises:
+        UserError: the disk is full or the folder cannot be written.
+    """
+    content = {"format": FORMAT, **checkpoint}
+    assert set(content) == _KEYS
+    with replacing(path) as file:
+        try:
+            torch.save(content, file)
+        except RuntimeError as error:
+            # torch's writer hides the operating system's error behind its own
+            if isinstance(error.__context__, OSError):
+                raise unwritable(path, error.__context__) from error
+            raise
+        if keep_previous and path.exists():
+            file.flush()
+            path.replace(previous(path))
+
+
+def previous(path: Path) -> Path:
+    """Where the checkpoint before the last one lies."""
+    return path.with_name(f"previous{path.suffix}")
+
+
+def load(path: Path) -> dict[str, Any]:
+    """Reads a checkpoint to the CPU and checks that it is whole (every stored block has a checksum).
+
+    Raises:
+        UserError: missing, damaged, or no checkpoint of ours.
+    """
+    if not path.is_file():
+        raise UserError(f"There is no checkpoint at {path}.")
+    if not zipfile.is_zipfile(path):
+        raise UserError(
+            f"{path} is no checkpoint, or its end is missing: give a .ckpt file of a run, or the run's folder."
+        )
+    try:
+        with zipfile.ZipFile(path) as archive:
+            broken = archive.testzip()
+        if broken is not None:
+            raise UserError(f"{path} is damaged (checksum of {broken}): use another checkpoint.")
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (OSError, RuntimeError, EOFError, KeyError, ValueError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path} is damaged or no checkpoint ({type(error).__name__}): use another one.") from error
+    if not isinstance(content, dict) or set(content) != _KEYS:
+        raise UserError(f"{path} is no apex_lab checkpoint: give a .ckpt file of a run, or the run's folder.")
+    if content["format"] != FORMAT:
+        raise UserError(
+            f"{path} has format {content['format']}, this version of apex_lab reads {FORMAT}: "
+            "use the version that wrote it."
+        )
+    return content

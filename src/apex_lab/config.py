@@ -1,0 +1,235 @@
+"""Where the configuration lies, what it may hold, and how a composed one is checked before anything starts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from apex_lab import components
+from apex_lab.components import did_you_mean, is_node, one_line
+from apex_lab.errors import UserError
+from apex_lab.scene import SceneModel
+from apex_lab.schedules import Constant
+
+
+def conf_dir() -> Path:
+    """The folder of configuration files: inside the installed package, else the repository's.
+
+    Raises:
+        UserError: neither is there (a damaged installation).
+    """
+    package = Path(__file__).resolve().parent
+    for folder in (package / "conf", package.parent.parent / "conf"):
+        if (folder / "train.yaml").is_file():
+            return folder
+    raise UserError(f"No configuration files at {package / 'conf'}: install apex_lab again.")
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class TrainerPart(_Part):
+    """How long and on what a model is trained; `steps` are weight updates."""
+
+    accelerator: Literal["auto", "cpu", "gpu"]
+    precision: Literal[32, "bf16-mixed"]
+    compile: bool
+    max_steps: int = Field(ge=1)
+    gradient_clip_norm: float | None = Field(gt=0)
+    log_interval: int = Field(ge=1)
+    validation_interval: int | None = Field(ge=1)
+    validation_videos: int | None = Field(ge=1)
+    checkpoint_interval: int = Field(ge=1)
+    monitor: str = Field(pattern="^val/.+")
+    monitor_mode: Literal["max", "min"]
+
+
+class EvaluationPart(_Part):
+    """What is measured and drawn at the end of training; `videos` null means the whole split."""
+
+    split: Literal["train", "val", "test"]
+    videos: int | None = Field(ge=1)
+    pictures: int = Field(ge=0)
+
+
+class PathsPart(_Part):
+    """Folders; relative ones are taken from where the command was started."""
+
+    outputs: str = Field(min_length=1)
+    data: str = Field(min_length=1)
+
+
+class Config(_Part):
+    """The root of what `python -m apex_lab.train` composes; components are checked by `apex_lab.components`."""
+
+    seed: int = Field(ge=0, lt=2**32)
+    model: dict[str, Any]
+    optimizer: dict[str, Any] | None
+    schedule: dict[str, dict[str, Any]]
+    loss: dict[str, float | dict[str, Any]]
+    data: dict[str, Any]
+    trainer: TrainerPart
+    logger: dict[str, dict[str, Any]]
+    callbacks: dict[str, dict[str, Any]]
+    evaluation: EvaluationPart
+    paths: PathsPart
+
+    @model_validator(mode="after")
+    def _components_named(self) -> Config:
+        named: dict[str, Any] = {"model": self.model, "data": self.data}
+        for group in ("schedule", "logger", "callbacks"):
+            named.update({f"{group}.{name}": node for name, node in getattr(self, group).items()})
+        if self.optimizer is not None:
+            named["optimizer"] = self.optimizer
+        for key, node in named.items():
+            if not is_node(node):
+                raise ValueError(f"{key} has no _target_: choose one of the shipped files or name the class to build")
+        return self
+
+
+@dataclass(frozen=True)
+class Job:
+    """One checked configuration.
+
+    Attributes:
+        config: the typed root.
+        raw: the same as plain containers with all interpolations resolved; what is stored and fingerprinted.
+        choices: group -> the word chosen for it ("model" -> "apex"); a group that was not chosen is missing.
+        overrides: the words on the command line, without sweeps.
+    """
+
+    config: Config
+    raw: dict[str, Any]
+    choices: dict[str, str] = field(default_factory=dict)
+    overrides: tuple[str, ...] = ()
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A composed configuration as plain containers, all interpolations resolved.
+
+    Raises:
+        UserError: a value that must be given is missing, or an interpolation leads nowhere.
+    """
+    try:
+        container = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        key = f"{error.full_key}: " if error.full_key else ""
+        raise UserError(f"{key}{one_line(Exception(str(error.msg).splitlines()[0]))}.") from error
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items()}
+
+
+def check_job(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str] = ()) -> Job:
+    """Checks everything that can be known before work starts; the first fault is told in one sentence.
+
+    Types and bounds of every key, components against their constructors' signatures, and whether model, schedules and
+    loss belong together. Components are built once (none reads data or starts anything when built).
+
+    Raises:
+        UserError: the sentence.
+    """
+    raw = {key: value for key, value in raw.items() if key != "hydra"}
+    config = components.validate(Config, raw, "")
+    assert isinstance(config, Config)
+    _check_components(config)
+    _check_objective(config)
+    return Job(config, raw, dict(choices), tuple(overrides))
+
+
+def build_model(config: Config) -> SceneModel:
+    """The model with weights drawn from the seed alone; the caller's random state is left as it was.
+
+    Raises:
+        UserError: the constructor refuses its values, or what was built is no `SceneModel`.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        model = components.build(config.model, "model")
+    if not isinstance(model, SceneModel):
+        raise UserError(f"model._target_ = {config.model['_target_']!r} is not an apex_lab.scene.SceneModel.")
+    return model
+
+
+def build_optimizer(config: Config, parameters: Sequence[torch.nn.Parameter]) -> torch.optim.Optimizer:
+    """The optimiser over the given parameters.
+
+    Raises:
+        UserError: none is configured, or its constructor refuses its values.
+    """
+    if config.optimizer is None:
+        raise UserError("optimizer = null, but the model has weights to train: choose one, such as torch.optim.Adam.")
+    optimizer = components.build(config.optimizer, "optimizer", params=parameters)
+    assert isinstance(optimizer, torch.optim.Optimizer)
+    return optimizer
+
+
+def build_schedules(config: Config) -> dict[str, Callable[[int], float]]:
+    """Schedule name -> schedule, as the model's forward takes them."""
+    return {name: components.build(node, f"schedule.{name}") for name, node in config.schedule.items()}
+
+
+def build_weights(config: Config) -> dict[str, Callable[[int], float]]:
+    """Loss term -> its weight as a schedule; a number is a weight that never changes."""
+    return {
+        name: components.build(value, f"loss.{name}") if isinstance(value, dict) else Constant(value)
+        for name, value in config.loss.items()
+    }
+
+
+def _check_components(config: Config) -> None:
+    components.check(config.model, "model")
+    components.check(config.data, "data")
+    if config.optimizer is not None:
+        components.check(config.optimizer, "optimizer", supplied=["params"])
+        rate = config.optimizer.get("lr")
+        if rate is not None and rate <= 0:
+            raise UserError(f"optimizer.lr = {rate} is wrong: a learning rate is above 0.")
+    for name, node in config.schedule.items():
+        components.check(node, f"schedule.{name}")
+    for name, weight in config.loss.items():
+        if isinstance(weight, dict):
+            if not is_node(weight):
+                raise UserError(f"loss.{name} = {weight!r} is wrong: give a number or a schedule with a _target_.")
+            components.check(weight, f"loss.{name}")
+    for name, node in config.logger.items():
+        components.check(node, f"logger.{name}", supplied=["run"])
+    for name, node in config.callbacks.items():
+        components.check(node, f"callbacks.{name}")
+
+
+def _check_objective(config: Config) -> None:
+    """Builds model, optimiser and schedules, and compares their names."""
+    model = build_model(config)
+    schedules, weights = build_schedules(config), build_weights(config)
+    components.build(config.data, "data")
+    for name, node in config.callbacks.items():
+        components.build(node, f"callbacks.{name}")
+    for kind, given in (("schedule", schedules), ("loss", weights)):
+        for name, value in given.items():
+            if not callable(value):
+                raise UserError(f"{kind}.{name} is not a schedule: choose one of apex_lab.schedules.")
+    _same_names("schedule", schedules, getattr(model, "schedule_names", ()))
+    _same_names("loss", weights, getattr(model, "term_names", ()))
+    if model.needs_training:
+        build_optimizer(config, [torch.nn.Parameter(torch.zeros(1))])
+
+
+def _same_names(key: str, given: Mapping[str, object], wanted: Sequence[str]) -> None:
+    for name in given:
+        if name not in wanted:
+            raise UserError(f"Unknown key {key}.{name}: the model has {_listed(wanted)}{did_you_mean(name, wanted)}.")
+    for name in wanted:
+        if name not in given:
+            raise UserError(f"{key}.{name} is missing: the model needs {_listed(wanted)}.")
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) if names else "none"

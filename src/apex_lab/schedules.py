@@ -1,0 +1,109 @@
+"""Values that depend on training progress (temperatures, priors, loss weights): schedule(step) -> float.
+
+A step is the number of weight updates already made, so the first batch sees step 0. Schedules are pure functions of the
+step: a resumed run sees the same values as an unbroken one.
+"""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Annotated
+
+from pydantic import Field
+
+Steps = Annotated[int, Field(ge=0)]
+
+
+class Schedule(ABC):
+    """A number as a function of the training step."""
+
+    @abstractmethod
+    def __call__(self, step: int) -> float:
+        """The value that the batch after `step` weight updates is trained with."""
+
+
+@dataclass(frozen=True)
+class Constant(Schedule):
+    """The same value at every step."""
+
+    value: float
+
+    def __call__(self, step: int) -> float:
+        return float(self.value)
+
+
+@dataclass(frozen=True)
+class _Ramp(Schedule):
+    """From `start` to `end` over `steps` steps after a `delay`; constant before and after.
+
+    With `steps` = 0 the value jumps from `start` to `end` at step `delay`.
+    """
+
+    start: float
+    end: float
+    steps: Steps
+    delay: Steps = 0
+
+    def __call__(self, step: int) -> float:
+        if step < self.delay:
+            return float(self.start)
+        if step >= self.delay + self.steps:
+            return float(self.end)
+        return self._between((step - self.delay) / self.steps)
+
+    @abstractmethod
+    def _between(self, progress: float) -> float:
+        """The value at a share `progress` in [0, 1) of the way."""
+
+
+@dataclass(frozen=True)
+class Linear(_Ramp):
+    """A straight line from `start` to `end`."""
+
+    def _between(self, progress: float) -> float:
+        return self.start + (self.end - self.start) * progress
+
+
+@dataclass(frozen=True)
+class Cosine(_Ramp):
+    """Half a cosine from `start` to `end`: flat at both ends."""
+
+    def _between(self, progress: float) -> float:
+        return self.end + (self.start - self.end) * 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
+@dataclass(frozen=True)
+class Exponential(_Ramp):
+    """A straight line in the logarithm from `start` to `end`; both must be positive."""
+
+    def __post_init__(self) -> None:
+        if self.start <= 0 or self.end <= 0:
+            raise ValueError(f"start = {self.start} and end = {self.end} must both be above 0")
+
+    def _between(self, progress: float) -> float:
+        return self.start * (self.end / self.start) ** progress
+
+
+@dataclass(frozen=True)
+class Piecewise(Schedule):
+    """Straight lines between knots (steps[i], values[i]); constant before the first and after the last."""
+
+    steps: list[Steps]
+    values: list[float]
+
+    def __post_init__(self) -> None:
+        if not self.steps or len(self.steps) != len(self.values):
+            raise ValueError(f"steps has {len(self.steps)} entries, values {len(self.values)}: give one value per step")
+        if any(a >= b for a, b in zip(self.steps, self.steps[1:], strict=False)):
+            raise ValueError(f"steps = {list(self.steps)} must increase from entry to entry")
+
+    def __call__(self, step: int) -> float:
+        if step <= self.steps[0]:
+            return float(self.values[0])
+        for i in range(1, len(self.steps)):
+            if step < self.steps[i]:
+                share = (step - self.steps[i - 1]) / (self.steps[i] - self.steps[i - 1])
+                return self.values[i - 1] + (self.values[i] - self.values[i - 1]) * share
+        return float(self.values[-1])

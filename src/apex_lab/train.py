@@ -1,0 +1,279 @@
+"""Trains a model on a data set and evaluates it.
+
+python -m apex_lab.train scale=cpu
+python -m apex_lab.train +ablation=no_entropy seed=0,1,2,3 scale=cpu -m
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import lightning as L
+import torch
+
+from apex_lab import callbacks, checkpoints, cli, components, console, evaluation
+from apex_lab.config import (
+    Config,
+    Job,
+    build_model,
+    build_optimizer,
+    build_schedules,
+    build_weights,
+    check_job,
+)
+from apex_lab.errors import UserError
+from apex_lab.files import read_json
+from apex_lab.learner import Learner, Stretches
+from apex_lab.loggers import Curves
+from apex_lab.runs import Run, group_name
+from apex_lab.scene import SceneModel, schedule_at
+
+
+def main() -> None:
+    """Entry point: `python -m apex_lab.train`."""
+    cli.launch("train", check_job, train, title)
+
+
+def title(job: Job) -> str:
+    """A run in a few words."""
+    return f"{group_name(job)}, seed {job.config.seed}"
+
+
+def train(job: Job) -> None:
+    """Brings a run to its end: says so if it is finished, goes on where it stopped, or starts it.
+
+    Raises:
+        UserError: the run cannot be done as asked; one sentence.
+    """
+    with Run(job) as run:
+        if run.finished:
+            console.say(f"finished already: {run.folder}")
+            _show(run)
+            return
+        device = _device(job.config)
+        run.start(cli.command_line(), device)
+        try:
+            with console.log_to(run.folder / "log.txt"):
+                _train(run, device)
+        except UserError as error:
+            run.fail(str(error))
+            raise
+        except cli.Interrupted as stop:
+            run.fail(f"stopped by {stop}")
+            raise
+        except BaseException as error:
+            run.fail(f"{type(error).__name__}: {components.one_line(error)}")
+            raise
+        run.finish()
+        _show(run)
+
+
+def _train(run: Run, device: torch.device) -> None:
+    config = run.job.config
+    checkpoint = _checkpoint(run)
+    console.say(f"{title(run.job)} on {device.type}: {run.folder}")
+    model = build_model(config)
+    if model.needs_training and checkpoint is None:
+        _say_duration(config, model, device)
+    data = components.build(config.data, "data")
+    data.prepare_data()
+    data.setup("fit")
+    _compare_data(run, data.fingerprint, checkpoint)
+    if checkpoint is None:
+        model.initialise(torch.as_tensor(data.train_median()))
+    else:
+        model.load_state_dict(checkpoint["weights"])
+        console.say(f"going on from step {checkpoint['step']}")
+    if model.needs_training:
+        _fit(run, model, data, checkpoint, device)
+    else:
+        checkpoints.save(run.last, _untrained(run, model))
+    _evaluate(run, model, data, device)
+
+
+def _fit(run: Run, model: SceneModel, data: Any, checkpoint: dict[str, Any] | None, device: torch.device) -> None:
+    """All weight updates that are left."""
+    config, settings = run.job.config, run.job.config.trainer
+    start = checkpoint["step"] if checkpoint else 0
+    if start >= settings.max_steps:
+        return
+    training = checkpoint["training"] if checkpoint else None
+
+    def optimizer(parameters: list[torch.nn.Parameter]) -> torch.optim.Optimizer:
+        built = build_optimizer(config, parameters)
+        if training is not None:
+            built.load_state_dict(training["optimizer"])
+        return built
+
+    learner = Learner(
+        model,
+        optimizer,
+        build_schedules(config),
+        build_weights(config),
+        seed=config.seed,
+        gradient_clip_norm=settings.gradient_clip_norm,
+        log_interval=settings.log_interval,
+        step=start,
+    )
+    if settings.compile:
+        model.compile()
+    data.start_step, data.max_steps = start, settings.max_steps
+    validation = settings.validation_interval
+    trainer = L.Trainer(
+        accelerator="gpu" if device.type == "cuda" else "cpu",
+        devices=1,
+        precision="bf16-mixed" if settings.precision == "bf16-mixed" else "32-true",
+        max_epochs=-1,
+        max_steps=settings.max_steps - start,
+        limit_val_batches=_validation_batches(config),
+        num_sanity_val_steps=0,
+        logger=_loggers(run, start),
+        callbacks=_callbacks(run, training),
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        inference_mode=False,
+        default_root_dir=run.folder,
+    )
+    batches = Stretches(data.train_dataloader(), learner, validation)
+    trainer.fit(learner, batches, data.val_dataloader() if validation is not None else None)
+
+
+def _evaluate(run: Run, model: SceneModel, data: Any, device: torch.device) -> None:
+    """Scores and pictures of the final weights, in the run's folder."""
+    config = run.job.config
+    settings = config.evaluation
+    schedule = schedule_at({n: s(config.trainer.max_steps) for n, s in build_schedules(config).items()}, device)
+    data.setup("test")
+    batches = getattr(data, f"{settings.split}_dataloader")()
+    precision = config.trainer.precision
+    scores, items = evaluation.evaluate(model, batches, schedule, device, precision, settings.videos, settings.pictures)
+    evaluation.draw(run.view_folder, items, run.curves_file)
+    evaluation.store(run.folder, settings.split, scores, settings.model_dump())
+
+
+def _show(run: Run) -> None:
+    """The row of scores and the pictures' paths."""
+    for split, part in read_json(run.metrics_file)["splits"].items():
+        total = {key: math.nan if value is None else value for key, value in part["total"].items()}
+        scores = evaluation.Scores(total, [], {})
+        console.say(f"{split}: {part['videos']} videos, {part['frames']} frames\n{scores.row()}")
+    for path in sorted(run.view_folder.glob("*")):
+        console.say(str(path))
+
+
+def _checkpoint(run: Run) -> dict[str, Any] | None:
+    """What to go on from; a damaged last checkpoint is told, and the one before it taken."""
+    paths = [path for path in (run.last, checkpoints.previous(run.last)) if path.exists()]
+    for path in paths:
+        try:
+            return checkpoints.load(path)
+        except UserError as error:
+            console.warn(str(error))
+    if paths:
+        raise UserError(
+            f"No whole checkpoint is left in {run.last.parent}: remove {run.folder} to start this run anew."
+        )
+    return None
+
+
+def _untrained(run: Run, model: SceneModel) -> dict[str, Any]:
+    job = run.job
+    return {"step": 0, "weights": model.state_dict(), "config": job.raw, "choices": job.choices, "training": None}
+
+
+def _compare_data(run: Run, found: str, checkpoint: dict[str, Any] | None) -> None:
+    """Refuses to go on with other data than the run began with."""
+    stored = run.record["data_fingerprint"]
+    if checkpoint is not None and stored is not None and stored != found:
+        raise UserError(
+            f"{run.folder} was begun with other data (fingerprint {stored[:8]}, now {found[:8]}): "
+            "bring the data back, or remove the run folder to start anew."
+        )
+    run.update(data_fingerprint=found)
+
+
+def _loggers(run: Run, step: int) -> list[Any]:
+    config = run.job.config
+    built = [
+        components.build(
+            node, f"logger.{name}", **({"run": run} if components.takes(node, f"logger.{name}", "run") else {})
+        )
+        for name, node in config.logger.items()
+    ]
+    return [Curves(run.curves_file, step), *built]
+
+
+def _callbacks(run: Run, training: dict[str, Any] | None) -> list[L.Callback]:
+    config = run.job.config
+    settings = config.trainer
+    keep = callbacks.Checkpoints(
+        run,
+        settings.checkpoint_interval,
+        settings.validation_interval,
+        settings.max_steps,
+        settings.monitor,
+        settings.monitor_mode,
+        training,
+    )
+    return [keep, *(components.build(node, f"callbacks.{name}") for name, node in config.callbacks.items())]
+
+
+def _validation_batches(config: Config) -> int | float:
+    settings = config.trainer
+    if settings.validation_interval is None:
+        return 0
+    if settings.validation_videos is None:
+        return 1.0
+    return math.ceil(settings.validation_videos / int(config.data["batch_size"]))
+
+
+def _device(config: Config) -> torch.device:
+    """The device that `trainer.accelerator` asks for.
+
+    Raises:
+        UserError: a GPU is asked for and there is none.
+    """
+    wanted = config.trainer.accelerator
+    if wanted == "gpu" and not torch.cuda.is_available():
+        raise UserError("trainer.accelerator = gpu, but PyTorch finds no CUDA device: use trainer=cpu or trainer=auto.")
+    return torch.device("cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu")
+
+
+LONG = 3 * 3600.0
+"""Seconds of training on a CPU above which a person is told before it starts."""
+
+
+def _say_duration(config: Config, model: SceneModel, device: torch.device) -> None:
+    """On a CPU, says how long training will take if that is long, measured on one short step."""
+    if device.type != "cpu":
+        return
+    seconds = estimate(config, model)
+    if seconds > LONG:
+        console.warn(
+            f"Training will take about {callbacks.readable(seconds)} on this CPU (estimated from one short step); "
+            "scale=cpu is made for CPUs: python -m apex_lab.train scale=cpu"
+        )
+
+
+def estimate(config: Config, model: SceneModel) -> float:
+    """Seconds that training takes on the CPU, from one step on one video of two frames, scaled up."""
+    frames, side = min(2, int(config.data["frames"])), int(config.data["image_size"])
+    schedule = schedule_at({name: value(0) for name, value in build_schedules(config).items()})
+    weights = build_weights(config)
+    with torch.random.fork_rng(devices=[]):
+        video = torch.rand(1, frames, 3, side, side)
+        model.train()
+        began = time.perf_counter()
+        terms = model(video, schedule).terms
+        torch.stack([terms[name].sum() * weight(0) for name, weight in weights.items()]).sum().backward()
+        seconds = time.perf_counter() - began
+    model.zero_grad(set_to_none=True)
+    return seconds / frames * int(config.data["frames"]) * int(config.data["batch_size"]) * config.trainer.max_steps
+
+
+if __name__ == "__main__":
+    main()
