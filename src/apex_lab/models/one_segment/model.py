@@ -1,0 +1,27 @@
+"""`one_segment`: what a collapsed model scores, a test of the evaluation itself.
+
+In a frame with n visible objects its unscaled covering is exactly 1 / (n + 1) and its ARI is 0 (metrics.md section 0).
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from apex_lab.models.regions import scene_of_regions
+from apex_lab.scene import Scene, SceneModel, Schedule
+
+
+class OneSegment(SceneModel):
+    """Everything is background, painted in the frame's mean colour. K = 1."""
+
+    needs_training = False
+    term_names: tuple[str, ...] = ()
+    schedule_names: tuple[str, ...] = ()
+
+    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
+        """RGB video in [0, 1]; `schedule` has no influence."""
+        batch, frames, _, height, width = video.shape
+        labels = torch.zeros(batch, frames, height, width, dtype=torch.long, device=video.device)
+        return scene_of_regions(video, labels, components=1)

@@ -1,0 +1,143 @@
+"""The curves of a run on one page."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib.style
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+from apex_lab.errors import UserError
+from apex_lab.view.canvas import picture_file
+from apex_lab.view.colors import PALETTE
+
+STEP = "step"
+SPLITS = ("train", "val", "test")
+_GROUPS = (*SPLITS, "diagnostics", "schedule")
+_IGNORED = ("epoch",)
+_COLUMNS = 4
+_SPLIT_COLORS = {"train": "#2d69c3", "val": "#d55e00", "test": "#009e73"}
+_NUMBERED = re.compile(r"^(?P<panel>.*?)[/_](?P<number>\d+)$")
+_REST = ""
+_ORDER = (
+    r"^loss$",
+    r"^ari_fg$",
+    r"^msc_fg$",
+    r"^ari$",
+    r"^msc$",
+    _REST,
+    r"^grad",
+    r"live|count",
+    r"window",
+    r"share|pixel|foreground",
+    r"prob",
+    r"^temperature|presence$",
+    r"^lr$|learning_rate|second|memory",
+)
+"""Panels in reading order, by what is found in their names; `_REST` is the loss terms and all not named here."""
+
+
+def curve_page(path: Path, curves_csv: Path) -> None:
+    """Draws every column of a run's curves.csv over `step`: small multiples, one panel per quantity.
+
+    Columns are named `group/quantity` (train, val, test, diagnostics, schedule, or nothing): the groups of one quantity
+    share a panel. Columns that differ by a number at the end (`diagnostics/share_0`, `diagnostics/share_1`, ...) share
+    a panel as well, one line each. Empty cells are skipped, so columns may be logged at steps of their own; columns
+    without any number are left out. Quantities that stay positive and mostly span more than two orders of magnitude
+    get a logarithmic axis. Long noisy curves are drawn faintly with their running median on top.
+
+    Args:
+        path: PNG to write; equal curves make equal bytes.
+        curves_csv: table with a column `step`.
+
+    Raises:
+        UserError: the table is missing, damaged or holds no number, or the picture cannot be written.
+    """
+    panels = _panels(_read(curves_csv))
+    rows = math.ceil(len(panels) / _COLUMNS)
+    # the user's own matplotlib settings must not change the picture
+    with matplotlib.style.context("default"):
+        figure = Figure(
+            figsize=(3.6 * _COLUMNS, 2.5 * rows + 0.3), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
+        )
+        FigureCanvasAgg(figure)
+        axes = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
+        for ax, (name, lines) in zip(axes, panels.items(), strict=False):
+            _draw(ax, name, lines)
+        for ax in axes[len(panels) :]:
+            ax.set_axis_off()
+        with picture_file(path) as file:
+            figure.savefig(file, format="png", metadata={"Software": None})
+
+
+def _read(curves_csv: Path) -> pd.DataFrame:
+    """The table's numbers, indexed by step, without empty columns."""
+    try:
+        table = pd.read_csv(curves_csv)
+    except FileNotFoundError:
+        raise UserError(f"{curves_csv} does not exist: train the run first, or name another run folder") from None
+    except (OSError, ValueError) as error:  # pandas' parser and encoding errors are ValueErrors
+        raise UserError(f"{curves_csv} cannot be read ({str(error).strip()}): restore or delete it") from error
+    if STEP not in table:
+        raise UserError(f"{curves_csv} has no column {STEP!r}: it is no table of curves")
+    table = table.apply(pd.to_numeric, errors="coerce").dropna(subset=[STEP])
+    # quantities of one step may stand in several rows, and a run that was resumed may have made a step twice
+    table = table.groupby(STEP).last().drop(columns=list(_IGNORED), errors="ignore")
+    table = table.replace([np.inf, -np.inf], np.nan).dropna(axis="columns", how="all")
+    if table.empty:
+        raise UserError(f"{curves_csv} holds no numbers yet: let the run make some steps first")
+    return table
+
+
+def _panels(table: pd.DataFrame) -> dict[str, list[tuple[str, str, pd.Series]]]:
+    """Panel -> its lines as (label, colour, values over step), panels in reading order."""
+    panels: dict[str, list[tuple[str, str, pd.Series]]] = {}
+    numbers = Counter(_NUMBERED.sub(r"\g<panel>", name) for name in map(str, table) if _NUMBERED.match(name))
+    for name in map(str, table):
+        head, _, tail = name.partition("/")
+        split, quantity = (head, tail) if head in _GROUPS and tail else ("", name)
+        label, color = split, _SPLIT_COLORS.get(split, _SPLIT_COLORS["train"])
+        match = _NUMBERED.match(quantity)
+        if match and numbers[_NUMBERED.sub(r"\g<panel>", name)] > 1:
+            quantity, label = match["panel"], f"{split} {match['number']}".strip()
+            color = PALETTE[int(match["number"]) % len(PALETTE)]
+        panels.setdefault(quantity, []).append((label, color, table[name].dropna()))
+    return {name: panels[name] for name in sorted(panels, key=_place)}
+
+
+def _place(name: str) -> int:
+    """Where a panel stands; panels at the same place keep their order."""
+    named = (i for i, pattern in enumerate(_ORDER) if pattern and re.search(pattern, name))
+    return next(named, _ORDER.index(_REST))
+
+
+def _draw(ax: Axes, name: str, lines: Sequence[tuple[str, str, pd.Series]]) -> None:
+    """One panel."""
+    for label, color, values in lines:
+        if len(values) > 100:
+            ax.plot(values.index, values, color=color, linewidth=0.7, alpha=0.3)
+            smooth = values.rolling(max(5, len(values) // 50), center=True, min_periods=1).median()
+            ax.plot(smooth.index, smooth, color=color, linewidth=1.5, label=label)
+        else:
+            marker = "o" if len(values) <= 30 else None
+            ax.plot(values.index, values, color=color, linewidth=1.5, marker=marker, markersize=3, label=label)
+    everything = np.concatenate([values.to_numpy(float) for _, _, values in lines])
+    low, high = np.quantile(everything, [0.05, 0.95])
+    if everything.min() > 0 and high > 100 * low:
+        ax.set_yscale("log")
+    ax.set_title(name.replace("_", " "), fontsize=10, fontweight="bold")
+    ax.tick_params(labelsize=8)
+    ax.grid(visible=True, color="#e3e6ea", linewidth=0.6)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.set_xlabel(STEP, fontsize=8)
+    if len(lines) > 1 or lines[0][0] in ("val", "test"):
+        ax.legend(fontsize=7, frameon=False, ncols=1 + len(lines) // 5)
