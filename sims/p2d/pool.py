@@ -1,0 +1,221 @@
+"""Several worker processes that make trajectories, watched: one that dies is replaced, its trajectory made again."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, Pipe, wait
+from pathlib import Path
+from typing import Any
+
+from sims.errors import SimError
+from sims.p2d.manifest import Facts, Record
+from sims.p2d.settings import Settings
+from sims.p2d.store import Key, no_room
+
+TRIES = 3
+"""How often a trajectory (or the start of a worker) may end with the death of its worker."""
+
+RECYCLE = 200
+"""Trajectories after which a worker is replaced: the physics engine's memory grows with every reset."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One trajectory to make; with `expected` it is written only if its checksum is that one."""
+
+    key: Key
+    expected: str | None = None
+
+
+class Pool:
+    """Worker processes for one folder. Use as a context manager: on leaving, whatever happened, no worker is left."""
+
+    def __init__(self, root: Path, settings: Settings, simulator: str, workers: int, recycle: int = RECYCLE) -> None:
+        self.job = (str(root), settings.model_dump_json(), simulator)
+        self.root, self.size, self.recycle = root, workers, recycle
+        self.workers: dict[Connection, _Worker] = {}
+        self.deaths: Counter[Key | None] = Counter()
+        self.facts: Facts | None = None
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for worker in self.workers.values():
+            worker.stop()
+        for worker in self.workers.values():
+            worker.end()
+        self.workers = {}
+
+    def start(self) -> Facts:
+        """Starts the first worker; returns what the simulator says about itself.
+
+        Raises:
+            SimError: the simulator is not installed or cannot start.
+        """
+        while self.facts is None:
+            if not self.workers:
+                self._add()
+            for worker, message in self._messages():
+                self._handle(worker, message, deque())
+        return self.facts
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[tuple[Key, Record]]:
+        """Makes all trajectories; yields each when its bytes have been written, in the order in which they finish.
+
+        Raises:
+            SimError: a trajectory cannot be made, is not what was expected, or there is no room on the disk.
+        """
+        queue = deque(tasks)
+        left = len(queue)
+        while left:
+            while len(self.workers) < min(self.size, left):
+                self._add()
+            for worker in self.workers.values():
+                if worker.idle and queue:
+                    worker.give(queue.popleft())
+            for worker, message in self._messages():
+                done = self._handle(worker, message, queue)
+                if done is not None:
+                    left -= 1
+                    yield done
+
+    def _add(self) -> None:
+        worker = _Worker(self.job)
+        self.workers[worker.connection] = worker
+
+    def _messages(self) -> Iterator[tuple[_Worker, tuple[Any, ...] | None]]:
+        """Waits for workers; yields each that has something to say with its message, None for a dead one's."""
+        for connection in wait(list(self.workers)):
+            worker = self.workers[connection]  # type: ignore[index]
+            try:
+                yield worker, worker.connection.recv()
+            except (EOFError, OSError):
+                yield worker, None
+
+    def _handle(
+        self, worker: _Worker, message: tuple[Any, ...] | None, queue: deque[Task]
+    ) -> tuple[Key, Record] | None:
+        if message is None:
+            self._bury(worker, queue)
+            return None
+        kind, *content = message
+        if kind == "ready":
+            self.facts = content[0]
+            worker.ready = True
+            self.deaths[None] = 0
+            return None
+        if kind == "failed":
+            raise SimError(content[0])
+        if kind == "disk":
+            raise no_room(OSError(content[0], ""), content[1])
+        task = worker.take()
+        if kind == "differs":
+            raise SimError(
+                f"trajectory {_name(task.key)} came out with other bytes than those recorded in {self.root}: it was "
+                "made with other versions or on another kind of processor; repair it there, or make the data anew"
+            )
+        if worker.made >= self.recycle:
+            del self.workers[worker.connection]
+            worker.stop()
+            worker.end()
+        return task.key, Record(checksum=content[0], redraws=content[1])
+
+    def _bury(self, worker: _Worker, queue: deque[Task]) -> None:
+        """A worker died: puts its trajectory back in front, unless it has cost too many workers already."""
+        del self.workers[worker.connection]
+        code = worker.end()
+        key = worker.task.key if worker.task else None
+        self.deaths[key] += 1
+        if self.deaths[key] >= TRIES:
+            what = f"making trajectory {_name(key)}" if key else "starting"
+            raise SimError(
+                f"a simulation worker died {TRIES} times while {what} ({_cause(code)}): {worker.last_words()}"
+            )
+        if worker.task:
+            queue.appendleft(worker.task)
+
+
+class _Worker:
+    def __init__(self, job: tuple[str, str, str]) -> None:
+        self.connection, theirs = Pipe()
+        self.log = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process
+        self.task: Task | None = None
+        self.ready = False
+        self.made = 0
+        environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(path or os.getcwd() for path in sys.path),
+            "PYTHONHASHSEED": "0",  # the same order of sets in every worker
+            "OMP_NUM_THREADS": "1",  # one core per worker, and sums in one order
+            "OPENBLAS_NUM_THREADS": "1",
+            "MKL_NUM_THREADS": "1",
+        }
+        with theirs:
+            self.process = subprocess.Popen(
+                [sys.executable, "-m", "sims.p2d.worker", str(theirs.fileno())],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=self.log,
+                stderr=self.log,
+                env=environment,
+            )
+        self._send(job)
+
+    @property
+    def idle(self) -> bool:
+        return self.ready and self.task is None
+
+    def give(self, task: Task) -> None:
+        self.task = task
+        self._send((*task.key, task.expected))
+
+    def take(self) -> Task:
+        task, self.task = self.task, None
+        assert task is not None
+        self.made += 1
+        return task
+
+    def _send(self, message: object) -> None:
+        try:
+            self.connection.send(message)
+        except OSError:
+            return  # it is dead; reading from it will say so
+
+    def stop(self) -> None:
+        """Asks the process to end."""
+        self.connection.close()
+        if self.task is not None or not self.ready:
+            self.process.terminate()
+
+    def end(self) -> int:
+        """Waits for the end of the process, helping it along if need be; returns its exit code."""
+        try:
+            code = self.process.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            code = self.process.wait()
+        self.connection.close()
+        return code
+
+    def last_words(self) -> str:
+        """The last line that the process printed."""
+        self.log.seek(0)
+        lines = self.log.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else "it printed nothing"
+
+
+def _name(key: Key) -> str:
+    return f"{key[0]}/{key[1]}"
+
+
+def _cause(code: int) -> str:
+    if code == -9:
+        return "killed, perhaps for lack of memory: try fewer workers"
+    return f"ended by signal {-code}" if code < 0 else f"exit code {code}"

@@ -1,0 +1,71 @@
+"""Settings from and to words `key=value`, and what is wrong with them in one sentence."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import shlex
+from typing import Any
+
+from pydantic import ValidationError
+
+from sims.errors import SimError
+from sims.p2d.settings import Settings
+
+
+class SettingsError(SimError):
+    """A wrong key or value on the command line."""
+
+
+def settings_from(words: list[str], base: Settings | None = None) -> Settings:
+    """Settings from words `key=value`; a value is JSON where it can be, else text; dots reach into nested settings.
+
+    Raises:
+        SettingsError: an unknown key or an impossible value, in one sentence.
+    """
+    data: dict[str, Any] = base.model_dump(mode="json") if base is not None else {}
+    for word in words:
+        key, equals, text = word.partition("=")
+        if not equals:
+            raise SettingsError(f"--set {word}: expected key=value, for example --set frames=20")
+        try:
+            value = json.loads(text)
+        except ValueError:
+            value = text
+        *parents, name = key.split(".")
+        place = data
+        for parent in parents:
+            place = place.setdefault(parent, {})
+            if not isinstance(place, dict):
+                raise SettingsError(f"--set {word}: {parent} has no settings inside")
+        place[name] = value
+    try:
+        return Settings.model_validate_json(json.dumps(data))
+    except ValidationError as error:
+        raise SettingsError(sentence(error)) from None
+
+
+def sentence(error: ValidationError) -> str:
+    """The first finding of a failed validation as one sentence that names the key, the value and the remedy."""
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        known = sorted(Settings.model_fields)
+        near = difflib.get_close_matches(key, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+        return f"unknown setting {key!r}: {hint}"
+    message = first["msg"].removeprefix("Value error, ")
+    if not key:
+        return f"settings do not fit together: {message}"
+    return f"setting {key}={first['input']!r} is not possible: {message[0].lower() + message[1:]}"
+
+
+def command_words(settings: Settings) -> str:
+    """The `--set` part of the command that makes data with these settings; empty for the defaults."""
+    default = Settings()
+    words = [
+        f"{name}={json.dumps(value)}"
+        for name, value in settings.model_dump(mode="json").items()
+        if value != default.model_dump(mode="json")[name]
+    ]
+    return f"--set {shlex.join(words)}" if words else ""

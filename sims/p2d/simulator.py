@@ -1,0 +1,37 @@
+"""The real simulator in the form in which `generate` takes one."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from pathlib import Path
+
+from sims import assets
+from sims.p2d.manifest import SIMULATION_VERSION, Facts
+from sims.p2d.settings import Settings
+from sims.p2d.simulate import camera, simulate
+
+__all__ = ["facts", "simulate"]
+
+
+def facts(settings: Settings) -> Facts:
+    """Versions of all that decides the bytes besides the settings, the camera, names of the classes."""
+    versions = {
+        "simulation": str(SIMULATION_VERSION),
+        "models": str(assets.FORMAT),
+        **assets.versions(),
+        "machine": platform.machine(),
+    }
+    if settings.objects_root is not None:
+        versions["objects_root"] = _digest(Path(settings.objects_root))
+    return {"versions": versions, "camera": camera(settings), "classes": list(settings.objects)}
+
+
+def _digest(folder: Path) -> str:
+    """Of names and bytes of all files in a folder of models."""
+    digest = hashlib.blake2b(digest_size=8)
+    for path in sorted(folder.rglob("*")):
+        if path.is_file():
+            digest.update(f"{path.relative_to(folder).as_posix()}\0{path.stat().st_size}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()

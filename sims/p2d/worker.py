@@ -1,0 +1,83 @@
+"""The process that makes trajectories for `pool.Pool`: takes (split, index), simulates, writes, answers.
+
+Started as `python -m sims.p2d.worker <file descriptor>`: a fresh interpreter that has imported nothing of its parent,
+so that PyTorch, threads and GPU memory of a training process are not copied along.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+from sims.errors import SimError
+from sims.p2d.settings import Settings
+from sims.p2d.store import Arrays, checksum, to_parts
+
+
+def main(descriptor: int) -> None:
+    """Serves the parent until it closes the connection or is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides what to do
+    parent = os.getppid()
+    connection: Connection = Connection(descriptor)
+    try:
+        root, settings, simulator = connection.recv()
+        serve(connection, Path(root), Settings.model_validate_json(settings), simulator, parent)
+    except (EOFError, BrokenPipeError, ConnectionResetError):
+        pass  # the parent has ended or needs this worker no more
+
+
+def serve(connection: Connection, root: Path, settings: Settings, simulator: str, parent: int) -> None:
+    """Says what the simulator is, then makes one trajectory after the other.
+
+    Messages sent: ("ready", facts), ("done", checksum, redraws), ("differs", checksum), ("failed", sentence),
+    ("disk", errno, file).
+    """
+    try:
+        module = importlib.import_module(simulator)
+        facts: dict[str, Any] = module.facts(settings)
+    except ModuleNotFoundError as error:
+        connection.send(("failed", _not_installed(error)))
+        return
+    except SimError as error:
+        connection.send(("failed", str(error)))
+        return
+    connection.send(("ready", facts))
+    arrays: dict[str, Arrays] = {}
+    while True:
+        split, index, expected = connection.recv()
+        try:
+            trajectory = module.simulate(settings, split, index)
+        except SimError as error:
+            connection.send(("failed", str(error)))
+            continue
+        parts = to_parts(settings, trajectory)
+        found = checksum(parts)
+        if os.getppid() != parent:
+            return  # killed: whoever goes on with this folder must find no one else writing
+        if expected not in (None, found):
+            connection.send(("differs", found))
+            continue
+        try:
+            if split not in arrays:
+                arrays[split] = Arrays(root, split, settings, writable=True)
+            arrays[split].write(index, parts)
+        except OSError as error:
+            connection.send(("disk", error.errno, str(error.filename or root)))
+            continue
+        connection.send(("done", found, int(trajectory.redraws)))
+
+
+def _not_installed(error: ModuleNotFoundError) -> str:
+    return (
+        f"P2D cannot be simulated here because the package {error.name!r} is not installed (pybullet has wheels up to "
+        "Python 3.11 only): make the data with Python 3.11 and copy the folder"
+    )
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

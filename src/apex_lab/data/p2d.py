@@ -1,0 +1,144 @@
+"""P2D as a plain torch data set: needs neither Lightning nor Hydra nor the simulator.
+
+```python
+from torch.utils.data import DataLoader
+from apex_lab.data import P2D
+
+for batch in DataLoader(P2D("data/p2d", "train"), batch_size=4, shuffle=True):
+    batch["video"], batch["segmentation"]  # uint8 (B, T, 3, H, W), uint8 (B, T, H, W)
+```
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from apex_lab.errors import UserError
+from sims.errors import SimError
+from sims.p2d.store import FIELDS, SPLITS, array_path
+from sims.p2d.verify import check
+
+MEDIAN_SAMPLE = 1000
+
+
+class P2D(Dataset[dict[str, Any]]):
+    """One split of a finished P2D folder, read through memory maps.
+
+    Items are dicts: `video` uint8 (T, 3, H, W), `segmentation` uint8 (T, H, W) with 0 background, 1 arm, 2 and up
+    objects, each the same number through the whole video, and `index`. Everything else that is known about a
+    trajectory comes from `meta`.
+
+    Args:
+        root: folder made by `python -m sims.p2d`.
+        split: "train", "val" or "test".
+        frames: length of the videos; None: all frames.
+        start: first frame.
+
+    Raises:
+        UserError: no such split or frames, or the folder is missing, unfinished, damaged or of another version.
+    """
+
+    def __init__(self, root: str | Path, split: str, frames: int | None = None, start: int = 0) -> None:
+        if split not in SPLITS:
+            raise UserError(f"P2D has no split {split!r}: choose one of {', '.join(SPLITS)}")
+        self.root, self.split = Path(root).absolute(), split
+        try:
+            self.manifest = check(self.root, splits=[split])
+        except SimError as error:
+            raise UserError(str(error)) from error
+        stored = self.manifest.settings.frames
+        end = stored if frames is None else start + frames
+        if not 0 <= start < end <= stored:
+            raise UserError(f"frames {start} to {end - 1} of {self.root} cannot be read: it has 0 to {stored - 1}")
+        self.clip = slice(start, end)
+        self._arrays: dict[str, np.ndarray] = {}
+
+    def __len__(self) -> int:
+        return int(getattr(self.manifest.settings, self.split))
+
+    def __getitem__(self, index: int) -> dict[str, Any]:
+        position = self._position(index)
+        video = self._array("rgb")[position, self.clip].transpose(0, 3, 1, 2)
+        segmentation = self._array("segmentation")[position, self.clip]
+        return {
+            "video": torch.from_numpy(np.array(video, order="C")),
+            "segmentation": torch.from_numpy(np.array(segmentation)),
+            "index": position,
+        }
+
+    def meta(self, index: int) -> dict[str, Any]:
+        """All labels of a trajectory besides the segmentation.
+
+        Returns:
+            `names`, the class name of each used object slot, and NumPy arrays as described in the folder's README:
+            depth, classes, poses, joints, gripper, visible_px, amodal_px, arm_contact, object_contact, aimed, redraws.
+        """
+        position = self._position(index)
+        found: dict[str, Any] = {}
+        for name, field in FIELDS.items():
+            if name not in ("rgb", "segmentation"):
+                part = self._array(name)[position]
+                found[name] = np.array(part[self.clip] if "T" in field.dims else part)
+        found["names"] = [self.manifest.classes[number] for number in found["classes"] if number >= 0]
+        return found
+
+    @property
+    def camera(self) -> dict[str, Any]:
+        """The camera: intrinsics 3 x 3, extrinsics 4 x 4 (world to camera), and what they were made of."""
+        return dict(self.manifest.facts["camera"])
+
+    def median(self, sample: int | None = MEDIAN_SAMPLE) -> Float[Tensor, "3 H W"]:
+        """Per-pixel median picture in [0, 1]: what is there when nothing stands in front of it.
+
+        Args:
+            sample: number of frames, evenly spaced over the split; None: all of them, which takes long.
+        """
+        frames = self._array("rgb").reshape(-1, *self._array("rgb").shape[2:])
+        if len(frames) == 0:
+            raise UserError(f"split {self.split} of {self.root} is empty, so it has no median picture")
+        count = len(frames) if sample is None else min(sample, len(frames))
+        cache = self.root / f".median_{self.split}_{count}_{self.manifest.content[:8]}.npy"
+        if not cache.exists():
+            chosen = (np.arange(count) * len(frames)) // count
+            median = _median(frames, chosen)
+            if not os.access(self.root, os.W_OK):
+                return torch.from_numpy(median)
+            draft = cache.with_name(f"{cache.name}.{os.getpid()}")
+            with open(draft, "wb") as file:
+                np.save(file, median)
+            os.replace(draft, cache)
+        return torch.from_numpy(np.load(cache))
+
+    def _position(self, index: int) -> int:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"trajectory {index} of split {self.split}, which has {len(self)}")
+        return index % len(self)
+
+    def _array(self, name: str) -> np.ndarray:
+        """The memory map of an array, opened at first use in each process."""
+        if name not in self._arrays:
+            mode = "r" if len(self) else None  # what is empty cannot be mapped
+            self._arrays[name] = np.load(array_path(self.root, self.split, name), mmap_mode=mode)  # type: ignore[arg-type]
+        return self._arrays[name]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_arrays": {}}
+
+
+def _median(frames: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """(N, H, W, 3) uint8 -> (3, H, W) float32 in [0, 1]; a few rows at a time."""
+    rows = []
+    step = max(1, 2**26 // (len(chosen) * frames.shape[2] * 3))
+    for top in range(0, frames.shape[1], step):
+        block = np.stack([frames[number, top : top + step] for number in chosen])
+        rows.append(np.median(block, axis=0))
+    median = np.concatenate(rows).astype(np.float32) / 255
+    return np.ascontiguousarray(median.transpose(2, 0, 1))
