@@ -10,14 +10,27 @@ from typing import Any
 import numpy as np
 import trimesh
 from PIL import Image
-from scipy.spatial import cKDTree
 
-from sims import meshes
+from sims import meshes, surfaces
 from sims.assets import file_hash, made_once
 from sims.bullet import load_pybullet_data
 
-FACE_SHARE = 0.05
-"""Faces kept of the visual meshes (101,735 in all)."""
+FACES = {
+    "panda_link0": 200,
+    "panda_link1": 200,
+    "panda_link2": 200,
+    "panda_link3": 250,
+    "panda_link4": 250,
+    "panda_link5": 350,
+    "panda_link6": 450,
+    "panda_link7": 200,
+    "panda_hand": 450,
+    "panda_leftfinger": 120,
+    "panda_rightfinger": 120,
+}
+"""Triangles kept of each drawn link, of 101,735 in all."""
+CELL_PX = 10
+POINTS_PER_M2 = 400_000
 
 JOINTS = (0, 1, 2, 3, 4, 5, 6, 9, 10)
 """PyBullet's indices of the seven arm joints and the two fingers."""
@@ -29,8 +42,6 @@ LOWER_RAD = (-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671)
 UPPER_RAD = (2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671)
 FORCE_N = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0, 20.0, 20.0)
 """Effort limits of the URDF: N m for the arm's joints, N for the fingers."""
-
-_PALETTE_CELL_PX = 8
 
 
 @dataclass(frozen=True)
@@ -53,7 +64,9 @@ def arm_model() -> ArmModel:
     source = Path(load_pybullet_data()) / "franka_panda"
     sources = sorted(path for path in source.rglob("*") if path.suffix in {".urdf", ".obj", ".mtl", ".png"})
     recipe: dict[str, object] = {
-        "faces": FACE_SHARE,
+        "faces": FACES,
+        "cell_px": CELL_PX,
+        "points_per_m2": POINTS_PER_M2,
         "sources": {str(path.relative_to(source)): file_hash(path) for path in sources},
     }
     folder = made_once("panda", recipe, lambda target: _make(source, target))
@@ -109,51 +122,45 @@ def _write_without(tree: ElementTree.ElementTree, kind: str, path: Path) -> None
 
 
 def _redraw(source: Path, target: Path) -> np.ndarray:
-    """Write a copy with few faces and one flat colour per face; returns its bounding box's corners."""
-    points, triangles, colours = _coloured_faces(source)
-    mesh = trimesh.Trimesh(points, triangles, process=False)
-    count = len(triangles) if len(triangles) < 1000 else max(120, int(FACE_SHARE * len(triangles)))
-    vertices, faces = meshes.decimate(mesh, count)
-    tree = cKDTree(points[triangles].mean(axis=1))
-    nearest = tree.query(vertices[faces].mean(axis=1))[1]
-    palette, index = np.unique(colours[nearest], axis=0, return_inverse=True)
-    picture = np.repeat(palette[None].astype(np.uint8), _PALETTE_CELL_PX, axis=0)
-    picture = np.repeat(picture, _PALETTE_CELL_PX, axis=1)
+    """Write a copy with few faces, its colours baked into a picture; returns its bounding box's corners (8, 3)."""
+    original = trimesh.load(source)
+    parts = list(original.geometry.values()) if isinstance(original, trimesh.Scene) else [original]
+    merged = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
+    smooth = surfaces.outer_surface(merged)
+    vertices, triangles = meshes.decimate(smooth, FACES[target.stem])
+    normals = surfaces.transferred_normals(vertices, triangles, smooth)
+    points, colours = _coloured_points(parts)
+    picture, uv = surfaces.bake(vertices, triangles, points, colours, CELL_PX)
     Image.fromarray(picture).save(target.with_suffix(".png"))
-    uv = np.empty((len(faces), 3, 2))
-    uv[..., 0] = ((index.ravel() + 0.5) / len(palette))[:, None]
-    uv[..., 1] = 0.5
-    meshes.write_obj(target, vertices, faces, meshes.corner_normals(vertices, faces), uv, f"{target.stem}.png")
+    meshes.write_obj(target, vertices, triangles, normals, uv, f"{target.stem}.png")
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
-def _coloured_faces(source: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertices (V, 3), triangles (F, 3) and an RGB colour per triangle (F, 3), coarse enough to share a palette."""
-    loaded = trimesh.load(source)
-    parts = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
-    points, triangles, colours, first = [], [], [], 0
+def _coloured_points(parts: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray]:
+    """Points spread over all parts (N, 3) and their colours (N, 3) uint8."""
+    points, colours = [], []
     for part in parts:
-        points.append(np.asarray(part.vertices))
-        triangles.append(np.asarray(part.faces) + first)
-        colours.append(_face_colours(part))
-        first += len(part.vertices)
-    return np.concatenate(points), np.concatenate(triangles), np.concatenate(colours)
+        count = max(50, int(part.area * POINTS_PER_M2))
+        where, face = trimesh.sample.sample_surface(part, count, seed=0)
+        points.append(where)
+        colours.append(_face_colours(part)[face])
+    return np.concatenate(points), np.concatenate(colours).astype(np.uint8)
 
 
 def _face_colours(part: trimesh.Trimesh) -> np.ndarray:
+    """(F, 3) a colour per triangle: of its texture's middle, or else of its material."""
     material = getattr(part.visual, "material", None)
     if material is None:
         return np.full((len(part.faces), 3), 255)
     image = getattr(material, "image", None)
     if image is None or part.visual.uv is None:
-        colour = np.asarray(material.main_color)[:3]
-        return np.tile(colour, (len(part.faces), 1))
+        return np.tile(np.asarray(material.main_color)[:3], (len(part.faces), 1))
     picture = np.asarray(image.convert("RGB"))
     centre = part.visual.uv[part.faces].mean(axis=1) % 1.0
     rows = ((1 - centre[:, 1]) * (picture.shape[0] - 1)).astype(int)
     columns = (centre[:, 0] * (picture.shape[1] - 1)).astype(int)
-    return picture[rows, columns] // 24 * 24
+    return picture[rows, columns]
 
 
 def joint_path(bullet: Any, arm: int, points: np.ndarray, yaw_rad: float) -> tuple[np.ndarray, float]:

@@ -10,7 +10,7 @@ import shutil
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -79,6 +79,12 @@ class ObjectModel:
     vertices: np.ndarray
     mass_kg: float
     rests: tuple[Rest, ...]
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """(8, 3) corners of the bounding box."""
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
     @property
     def extents_m(self) -> np.ndarray:

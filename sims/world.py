@@ -6,13 +6,10 @@ import numpy as np
 
 from sims import arm as panda
 from sims.assets import ObjectModel
+from sims.background import TABLE_HIGH_M, TABLE_LOW_M, TABLE_THICKNESS_M
 from sims.bullet import Client
 
 STEPS_PER_S = 240
-TABLE_LOW_M = (-0.25, -0.7)
-TABLE_HIGH_M = (1.0, 0.7)
-TABLE_THICKNESS_M = 0.04
-FLOOR_Z_M = -0.75
 
 
 class World:

@@ -24,6 +24,8 @@ RAMP_S = 0.25
 WAYPOINT_M = 0.02
 IK_ERROR_M = 0.003
 START_GAP_M = 0.01
+RESOLUTION_DIGITS = 5
+"""Poses are kept to 10 micrometres, so that what rests has the same pose in every frame."""
 
 
 class Unusable(Exception):
@@ -170,6 +172,7 @@ def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[Ob
         frames.append((poses, world.joints(), world.gripper(), arm_contact.copy(), object_contact.copy()))
         arm_contact[:], object_contact[:] = False, False
     poses, joints, gripper, arm, other = (np.stack(column) for column in zip(*frames, strict=True))
+    poses = np.round(poses, RESOLUTION_DIGITS)
     return Episode(poses.astype(np.float32), joints.astype(np.float32), gripper.astype(np.float32), arm, other)
 
 
@@ -184,12 +187,12 @@ def _check(settings: Settings, poses: np.ndarray, models: tuple[ObjectModel, ...
 def _label(settings: Settings, spec: Spec, episode: Episode, models: tuple[ObjectModel, ...]) -> Trajectory:
     """Draw every frame of an episode and pad the slots."""
     renderer = _renderer(os.getpid(), settings)
-    renderer.show([models[placement.class_index] for placement in spec.objects])
+    renderer.show(tuple(models[placement.class_index] for placement in spec.objects))
     used, slots = len(spec.objects), settings.max_objects
     pictures, amodal = [], []
     for joints, poses in zip(episode.joints, episode.poses, strict=True):
         pictures.append(renderer.picture(joints, poses))
-        amodal.append(renderer.amodal_px(joints, poses))
+        amodal.append(renderer.amodal_px(joints, poses, pictures[-1]))
     segmentation = np.stack([picture.segmentation for picture in pictures])
     visible = np.stack([(segmentation == 1 + part).sum(axis=(1, 2)) for part in range(slots + 1)], axis=1)
     padded = slots - used
