@@ -1,0 +1,237 @@
+"""All metrics of one video, reduced to counts and small tables that add up over videos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+import torch
+from jaxtyping import Float64, Int64, Integer
+
+from apex_lab.metrics.boundary import TOLERANCE, BoundaryScores, boundary_scores
+from apex_lab.metrics.contingency import Contingency, contingency
+from apex_lab.metrics.hota import HotaCounts
+from apex_lab.metrics.identity import IdentityCounts
+from apex_lab.metrics.keys import KEYS
+from apex_lab.metrics.objects import ObjectMetadata, object_rows
+from apex_lab.metrics.overlap import mean_best_overlap, mean_matched_iou
+from apex_lab.metrics.segmentation import SCORES, video_scores
+from apex_lab.metrics.tracking import Detections, Events, TrackingCounts, TrackingSettings, clear_events, detections
+
+
+@dataclass(frozen=True)
+class EvaluatorSettings:
+    """How videos are scored; stored with the results.
+
+    Attributes:
+        tracking: frames, thresholds and treatment of the background for CLEAR MOT, IDF1 and HOTA.
+        public_first_frame: CLEAR MOT and IDF1 are given once more from this frame on (the public protocol); None
+            leaves that out.
+        skip_empty: leaves frames without any object out of the foreground means of ARI and covering.
+        boundary_tolerance: for F, a share of the image diagonal.
+        identities: `own` are the model's; `none` leaves out all that needs identities over time (NaN); `linked` takes
+            segments of consecutive frames linked by overlap, an extra for models without identities.
+        per_frame: keep a row per frame.
+        events: keep the CLEAR MOT events.
+    """
+
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    public_first_frame: int | None = 2
+    skip_empty: bool = False
+    boundary_tolerance: float = TOLERANCE
+    identities: Literal["own", "none", "linked"] = "own"
+    per_frame: bool = False
+    events: bool = False
+
+    def __post_init__(self) -> None:
+        if self.identities not in ("own", "none", "linked"):
+            raise ValueError(f"identities is {self.identities!r}; choose own, none or linked")
+        if not 0 < self.boundary_tolerance < 1:
+            raise ValueError(f"boundary_tolerance is {self.boundary_tolerance}; it must lie in (0, 1)")
+        self.protocols()
+
+    def protocols(self) -> dict[str, TrackingSettings]:
+        """Suffix of the keys -> what is evaluated under them."""
+        found = {"": self.tracking}
+        if self.public_first_frame is not None:
+            public = asdict(self.tracking) | {"first_frame": self.public_first_frame}
+            found[f"_start{self.public_first_frame}"] = TrackingSettings(**public)
+        return found
+
+
+@dataclass(frozen=True)
+class TrackRecord:
+    """What of one video needs identities over time.
+
+    Attributes:
+        volumes: name -> score of space-time volumes.
+        clear, identity: suffix of the protocol -> counts.
+        hota: counts.
+        j, f: sums over objects, each the mean over its frames.
+        objects: number of objects.
+        events: frame, type, true label, identity, distance, where wanted; NaN where there is none.
+    """
+
+    volumes: dict[str, float]
+    clear: dict[str, TrackingCounts]
+    identity: dict[str, IdentityCounts]
+    hota: HotaCounts
+    j: float
+    f: float
+    objects: int
+    events: Float64[np.ndarray, "N 5"]
+
+
+@dataclass(frozen=True)
+class VideoRecord:
+    """What is kept of one video.
+
+    Attributes:
+        size: height and width.
+        frames, empty_frames: how many, and how many of them without any visible object.
+        scores: name -> sum of a frame score over the frames that have a value, and their number.
+        tracks: None for models without identities.
+        objects: `objects.object_rows`.
+        rows: one per frame, where wanted.
+    """
+
+    size: tuple[int, int]
+    frames: int
+    empty_frames: int
+    scores: dict[str, tuple[float, int]]
+    tracks: TrackRecord | None
+    objects: pd.DataFrame
+    rows: list[dict[str, float]]
+
+
+@dataclass(frozen=True)
+class _Table:
+    """The contingency table of the one video at hand."""
+
+    batch: Contingency
+    counts: Int64[np.ndarray, "T G P"]
+    labels: Int64[np.ndarray, "G"]
+    ids: Int64[np.ndarray, "P"]
+
+
+def score_video(
+    prediction: Integer[np.ndarray, "T H W"],
+    truth: Integer[np.ndarray, "T H W"],
+    settings: EvaluatorSettings,
+    metadata: ObjectMetadata | None = None,
+    background_ids: Collection[int] = (),
+) -> VideoRecord:
+    """Scores one video; arguments as in `Evaluator.add`, identities as they are."""
+    prediction, truth = (np.ascontiguousarray(labels).astype(np.int64) for labels in (prediction, truth))
+    batch = contingency(torch.from_numpy(prediction)[None], torch.from_numpy(truth)[None])
+    table = _Table(batch, batch.counts[0].numpy(), batch.labels[0].numpy(), batch.ids[0].numpy())
+    columns = _frame_scores(table, settings.skip_empty)
+    scores = {name: _sum_and_count(values) for name, values in columns.items()}
+    if settings.identities == "none":
+        tracks = None
+        objects = object_rows(table.counts, table.labels, metadata)
+    else:
+        kept = np.flatnonzero(np.isin(table.ids, list(background_ids))).tolist()
+        frames = {name: detections(table.counts, protocol, kept) for name, protocol in settings.protocols().items()}
+        events = {name: clear_events(frames[name], p.min_iou) for name, p in settings.protocols().items()}
+        boundary = boundary_scores(
+            prediction, truth, table.counts, table.labels, table.ids, settings.boundary_tolerance
+        )
+        tracks = _track_record(table, settings, frames, events, boundary)
+        objects = object_rows(table.counts, table.labels, metadata, boundary, frames[""], events[""])
+        if settings.per_frame:
+            columns |= _boundary_columns(boundary) | _tracking_columns(frames[""], events[""], len(truth))
+    return VideoRecord(
+        size=(truth.shape[1], truth.shape[2]),
+        frames=len(truth),
+        empty_frames=int(batch.empty_frames.sum()),
+        scores=scores,
+        tracks=tracks,
+        objects=objects,
+        rows=_rows(columns, len(truth)) if settings.per_frame else [],
+    )
+
+
+def tracking_values(clear: TrackingCounts, identity: IdentityCounts, suffix: str = "") -> dict[str, float]:
+    """Rates, IDF1 and counts under the keys of an evaluation."""
+    values = clear.rates() | {"idf1": identity.idf1()} | asdict(clear)
+    return {name + suffix: value for name, value in values.items()}
+
+
+def _frame_scores(table: _Table, skip_empty: bool) -> dict[str, Float64[np.ndarray, "T"]]:
+    scores = {name: video_scores(table.batch, name, "frame", skip_empty)[0].numpy() for name in SCORES}
+    scores["mbo"] = np.array([mean_best_overlap(frame) for frame in table.counts])
+    scores["miou"] = np.array([mean_matched_iou(frame) for frame in table.counts])
+    return scores
+
+
+def _volume_scores(table: _Table, skip_empty: bool) -> dict[str, float]:
+    scores = {f"video_{name}": float(video_scores(table.batch, name, "sequence", skip_empty)) for name in SCORES}
+    volume = table.counts.sum(axis=0)
+    return scores | {"video_mbo": mean_best_overlap(volume), "video_miou": mean_matched_iou(volume)}
+
+
+def _track_record(
+    table: _Table,
+    settings: EvaluatorSettings,
+    frames: dict[str, list[Detections]],
+    events: dict[str, Events],
+    boundary: BoundaryScores,
+) -> TrackRecord:
+    shape = (len(table.labels), len(table.ids))
+    protocols = settings.protocols().items()
+    return TrackRecord(
+        volumes=_volume_scores(table, settings.skip_empty),
+        clear={name: TrackingCounts.of_video(frames[name], events[name], p.tracked_share) for name, p in protocols},
+        identity={name: IdentityCounts.of_video(frames[name], shape, p.min_iou) for name, p in protocols},
+        hota=HotaCounts.of_video(frames[""], shape),
+        j=math.fsum(boundary.j.mean(axis=1)),
+        f=math.fsum(boundary.f.mean(axis=1)),
+        objects=len(boundary.j),
+        events=_event_table(events[""], table) if settings.events else np.empty((0, 5)),
+    )
+
+
+def _event_table(events: Events, table: _Table) -> Float64[np.ndarray, "N 5"]:
+    """Rows and columns of the table replaced by labels and identities."""
+    label = np.where(events.row < 0, np.nan, table.labels[events.row])
+    identity = np.where(events.column < 0, np.nan, table.ids[events.column])
+    return np.column_stack([events.frame, events.type, label, identity, events.distance])
+
+
+def _boundary_columns(boundary: BoundaryScores) -> dict[str, Float64[np.ndarray, "T"]]:
+    if not len(boundary.j):
+        return {}
+    j, f = boundary.j.mean(axis=0), boundary.f.mean(axis=0)
+    return {"j": j, "f": f, "jf": (j + f) / 2}
+
+
+def _tracking_columns(
+    frames: Sequence[Detections], events: Events, n_frames: int
+) -> dict[str, Float64[np.ndarray, "T"]]:
+    """Tracking values per frame; NaN in frames that are not evaluated."""
+    columns: dict[str, Float64[np.ndarray, "T"]] = {}
+    for found in frames:
+        here = events.frame == found.frame
+        part = Events(*(getattr(events, name)[here] for name in ("frame", "type", "row", "column", "distance")))
+        counts = TrackingCounts.of_video([found], part)
+        for name, value in (counts.rates() | asdict(counts)).items():
+            columns.setdefault(name, np.full(n_frames, np.nan))[found.frame] = value
+    return columns
+
+
+def _rows(columns: dict[str, Float64[np.ndarray, "T"]], n_frames: int) -> list[dict[str, float]]:
+    names = [name for name, key in KEYS.items() if "frame" in key.levels]
+    return [
+        {"frame": t} | {name: float(columns[name][t]) if name in columns else math.nan for name in names}
+        for t in range(n_frames)
+    ]
+
+
+def _sum_and_count(values: Float64[np.ndarray, "T"]) -> tuple[float, int]:
+    known: Any = values[~np.isnan(values)]
+    return math.fsum(known), len(known)
