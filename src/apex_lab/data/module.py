@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
+from jaxtyping import Float
 from lightning import LightningDataModule
 from pydantic import Field, ValidationError
+from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from apex_lab.data.batches import TrainBatches
@@ -44,7 +46,7 @@ class P2DModule(LightningDataModule):
         image_size: height and width in pixels.
         simulation: further settings of the simulation (`sims.p2d.settings.Settings`), for example max_objects.
         batch_size: videos per training step.
-        eval_batch_size: videos per validation and test step.
+        eval_batch_size: videos per validation and test step; None: as `batch_size`.
         workers: processes that load data; 0 loads in the training process.
         generate: make missing data; False: refuse.
         sim_workers: processes that make data; None: one per core.
@@ -67,7 +69,7 @@ class P2DModule(LightningDataModule):
         image_size: Annotated[int, Field(ge=16, le=1024)] = 128,
         simulation: dict[str, Any] | None = None,
         batch_size: Annotated[int, Field(gt=0)] = 4,
-        eval_batch_size: Annotated[int, Field(gt=0)] = 4,
+        eval_batch_size: Annotated[int, Field(gt=0)] | None = None,
         workers: Annotated[int, Field(ge=0)] = 2,
         generate: bool = True,
         sim_workers: Annotated[int, Field(gt=0)] | None = None,
@@ -76,7 +78,8 @@ class P2DModule(LightningDataModule):
         super().__init__()
         sizes = {"train": train, "val": val, "test": test, "frames": frames, "image_size": image_size}
         self.settings = _settings({"seed": data_seed, **sizes}, simulation or {})
-        self.seed, self.batch_size, self.eval_batch_size, self.workers = seed, batch_size, eval_batch_size, workers
+        self.seed, self.workers = seed, workers
+        self.batch_size, self.eval_batch_size = batch_size, eval_batch_size or batch_size
         self.generate, self.sim_workers, self.verify = generate, sim_workers, verify
         name = f"p2d_{image_size}px_{frames}f_{fingerprint(self.settings)[:8]}"
         self.folder = Path(root).expanduser().absolute() / name
@@ -139,9 +142,24 @@ class P2DModule(LightningDataModule):
             data = Subset(self.sets[split], range(min(videos, len(self.sets[split]))))
         return DataLoader(data, batch_size=self.eval_batch_size, **self._options())
 
+    def train_median(self) -> Float[Tensor, "3 H W"]:
+        """Per-pixel median picture of the training split, in [0, 1]; call after `setup`."""
+        return self.sets["train"].median()
+
+    @property
+    def fingerprint(self) -> str:
+        """32 hex digits that are equal only for equal bytes; call after `prepare_data`."""
+        return self._manifest().content
+
+    def _manifest(self) -> Manifest:
+        try:
+            return check(self.folder, self.settings)
+        except SimError as error:
+            raise UserError(str(error)) from error
+
     def describe(self) -> dict[str, Any]:
         """What the record of a run keeps about its data; call after `prepare_data`."""
-        manifest: Manifest = check(self.folder, self.settings)
+        manifest = self._manifest()
         counts = {split: getattr(self.settings, split) for split in ("train", "val", "test")}
         return {
             "name": "p2d",
@@ -168,11 +186,11 @@ def _settings(fixed: dict[str, Any], further: Mapping[str, Any]) -> Settings:
     for key in further:
         if key in fixed:
             word = "data_seed" if key == "seed" else key
-            raise UserError(f"data.simulation.{key} is not a key: set data.{word} instead")
+            raise UserError(f"simulation.{key} is not a key: set data.{word} instead")
     try:
         return Settings(**fixed, **_plain(further))
     except ValidationError as error:
-        raise UserError(f"data: {sentence(error)}") from None
+        raise UserError(sentence(error)) from None
 
 
 def _plain(value: Any) -> Any:
