@@ -6,18 +6,32 @@ Nothing here knows a model.
 
 from __future__ import annotations
 
+from apex_lab.metrics.evaluator import Evaluator
+from apex_lab.metrics.keys import KEYS
+from apex_lab.metrics.linking import link_frames
 from apex_lab.metrics.modules import AdjustedRandIndex, SceneMetrics, SegmentationCovering, SegmentationScore
+from apex_lab.metrics.objects import ObjectMetadata, by_property, p2d_metadata
+from apex_lab.metrics.record import EvaluatorSettings
 from apex_lab.metrics.scenes import resize_masks, scene_identities
 from apex_lab.metrics.segmentation import ari, ari_fg, covering
+from apex_lab.metrics.tracking import TrackingSettings
 
 __all__ = [
+    "KEYS",
     "AdjustedRandIndex",
+    "Evaluator",
+    "EvaluatorSettings",
+    "ObjectMetadata",
     "SceneMetrics",
     "SegmentationCovering",
     "SegmentationScore",
+    "TrackingSettings",
     "ari",
     "ari_fg",
+    "by_property",
     "covering",
+    "link_frames",
+    "p2d_metadata",
     "resize_masks",
     "scene_identities",
 ]

@@ -9,6 +9,7 @@ import argparse
 import cProfile
 import pstats
 import time
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -42,7 +43,8 @@ def synthetic_video(
     return np.where(found > 0, found, strip[None, :, None]), truth
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point; `arguments` are those of the command line where missing."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--videos", type=int, default=200)
     parser.add_argument("--frames", type=int, default=20)
@@ -51,7 +53,7 @@ def main() -> None:
     parser.add_argument("--segments", type=int, default=8)
     parser.add_argument("--per-frame", action="store_true", help="keep rows per frame and events")
     parser.add_argument("--profile", action="store_true", help="show where the time goes")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     evaluator = Evaluator(EvaluatorSettings(per_frame=options.per_frame, events=options.per_frame))
     profile = cProfile.Profile()
     spent = 0.0

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Int64, Integer
 from scipy.optimize import linear_sum_assignment
 
-from apex_lab.metrics.contingency import compact, contingency
+from apex_lab.metrics.contingency import PAD, compact, contingency
 
 
 def link_frames(prediction: Integer[np.ndarray, "T H W"]) -> Int64[np.ndarray, "T H W"]:
@@ -29,9 +29,11 @@ def link_frames(prediction: Integer[np.ndarray, "T H W"]) -> Int64[np.ndarray, "
         iou = counts / (counts.sum(axis=1, keepdims=True) + counts.sum(axis=0, keepdims=True) - counts)
         i, j = linear_sum_assignment(iou, maximize=True)
         same = iou[i, j] > 0
-        now = np.arange(used, used + iou.shape[1])
+        now = np.full(iou.shape[1], PAD)
         now[j[same]] = names[-1][i[same]]
-        used = max(used, int(now.max()) + 1)
+        new = np.flatnonzero(now == PAD)
+        now[new] = np.arange(used, used + len(new))
+        used += len(new)
         names.append(now)
     linked = [name[segment.numpy()] for name, segment in zip(names, segments, strict=True)]
     return np.concatenate(linked).reshape(prediction.shape)

@@ -127,7 +127,7 @@ def by_property(objects: pd.DataFrame, bins: int = 4) -> pd.DataFrame:
         known = objects[objects[name].notna()]
         if known.empty:
             continue
-        group = known[name] if name == "class" else pd.qcut(known[name].astype(float), bins, duplicates="drop")
+        group = known[name] if name == "class" else _intervals(known[name].astype(float), bins)
         grouped = known.groupby(group.rename("group"), observed=True)
         part = grouped[_OUTCOMES].mean()
         part.insert(0, "objects", grouped.size())
@@ -136,6 +136,14 @@ def by_property(objects: pd.DataFrame, bins: int = 4) -> pd.DataFrame:
         parts.append(part.astype({"group": str}))
     columns = ["property", "group", "objects", *_OUTCOMES]
     return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=columns)
+
+
+def _intervals(values: pd.Series, bins: int) -> pd.Series:
+    """The interval of about equally filled ones that each value lies in."""
+    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
+    if len(edges) == 1:
+        return pd.Series(f"{edges[0]:g}", index=values.index)
+    return pd.cut(values, edges.tolist(), include_lowest=True)
 
 
 def _metadata_columns(
