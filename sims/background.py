@@ -8,8 +8,8 @@ import numpy as np
 
 from sims.camera import Camera
 
-TABLE_LOW_M = (-0.35, -0.65)
-TABLE_HIGH_M = (1.05, 0.65)
+TABLE_LOW_M = (-0.35, -0.6)
+TABLE_HIGH_M = (1.25, 0.9)
 """The table's top lies at z = 0, the robot's base stands on it at the origin."""
 TABLE_THICKNESS_M = 0.04
 FLOOR_Z_M = -0.75

@@ -1,7 +1,8 @@
-"""Geometry that is made once: object frames, few-faced copies, normals, texture coordinates, collision hulls, OBJ files."""
+"""Geometry that is made once: object frames, few-faced copies, normals, collision hulls, OBJ files."""
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 
 import fast_simplification
@@ -34,6 +35,12 @@ def object_frame(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def _rotation2(angle: float) -> np.ndarray:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def box_corners(points: np.ndarray) -> np.ndarray:
+    """(8, 3) corners of the bounding box of a cloud (N, 3)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
 
 
 def decimate(mesh: trimesh.Trimesh, faces: int) -> tuple[np.ndarray, np.ndarray]:
@@ -70,7 +77,7 @@ def corner_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return normals
 
 
-def hull_vertices(points: np.ndarray, directions: int = 400) -> np.ndarray:
+def hull_vertices(points: np.ndarray, directions: int = 160) -> np.ndarray:
     """(N, 3): the extreme points of a cloud in evenly spread directions; a light convex hull for contacts."""
     index = np.arange(directions) + 0.5
     height = 1 - 2 * index / directions
@@ -95,14 +102,13 @@ def convex_parts(points: np.ndarray, name: str, convex: bool) -> list[np.ndarray
         outside = np.linalg.norm(points[:, :2] - centre, axis=1) > radius * 1.03
         edges = np.quantile(points[outside, 2], [0, 1 / 3, 2 / 3, 1])
         handle = [
-            points[outside & (points[:, 2] >= low) & (points[:, 2] <= high)]
-            for low, high in zip(edges[:-1], edges[1:], strict=True)
+            points[outside & (points[:, 2] >= low) & (points[:, 2] <= high)] for low, high in itertools.pairwise(edges)
         ]
         return [hull_vertices(points[~outside]), *(hull_vertices(part, 60) for part in handle)]
     edges = np.linspace(points[:, 0].min(), points[:, 0].max(), 7)
     overlap = (edges[1] - edges[0]) * 0.05
     parts = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in itertools.pairwise(edges):
         slice_ = points[(points[:, 0] >= low - overlap) & (points[:, 0] <= high + overlap)]
         if len(slice_) >= 4:
             parts.append(hull_vertices(slice_, 80))
@@ -112,7 +118,6 @@ def convex_parts(points: np.ndarray, name: str, convex: bool) -> list[np.ndarray
 def _cup(points: np.ndarray) -> tuple[np.ndarray, float]:
     """Centre (2,) and radius of a mug's cup: the circle that the side opposite the handle lies on."""
     low = points[points[:, 2] < np.quantile(points[:, 2], 0.05)][:, :2]
-    system = np.column_stack([2 * low, np.ones(len(low))])
     outline = trimesh.convex.hull_points(low)
     system = np.column_stack([2 * outline, np.ones(len(outline))])
     solution = np.linalg.lstsq(system, (outline**2).sum(axis=1), rcond=None)[0]

@@ -23,11 +23,11 @@ LIGHT_DIRECTION = (0.35, -0.5, 1.0)
 AMBIENT, DIFFUSE, SPECULAR = 0.58, 0.52, 0.04
 SHADOW_SIZE_PX = 96
 SHADOW_BLUR_PX = 1.0
-SHADOW_STRENGTH = 0.42
+SHADOW_STRENGTH = 0.3
 SUN = Camera(
     eye=tuple(float(0.5 * (axis == 0) + 3.0 * LIGHT_DIRECTION[axis]) for axis in range(3)),  # type: ignore[arg-type]
     target=(0.5, 0.0, 0.0),
-    fov_deg=18.0,
+    fov_deg=22.0,
     near_m=0.5,
     far_m=6.0,
 )

@@ -39,9 +39,9 @@ class Settings(BaseModel):
     """Classes to draw from, without repetition within a trajectory."""
     objects_root: str | None = None
     """Folder of textured models, one sub-folder per object with an OBJ and its PNG; None: the project's own textures."""
-    workspace_x: Span = (0.38, 0.66)
+    workspace_x: Span = (0.39, 0.65)
     """Where objects are put and lines run, metres in front of the robot's base."""
-    workspace_y: Span = (-0.2, 0.2)
+    workspace_y: Span = (-0.14, 0.14)
     """Likewise to its left."""
     height_m: float = Field(default=0.025, gt=0, le=0.2)
     """Of the fingertips above the table."""

@@ -14,7 +14,8 @@ from sims.errors import SimError
 from sims.p2d.settings import Settings
 from sims.p2d.spec import Spec, sample
 from sims.p2d.trajectory import Trajectory
-from sims.render import Renderer
+from sims.background import TABLE_HIGH_M, TABLE_LOW_M
+from sims.render import Renderer, rotation
 from sims.world import STEPS_PER_S, World
 
 SETTLE_S = 1.5
@@ -24,6 +25,8 @@ RAMP_S = 0.25
 WAYPOINT_M = 0.02
 IK_ERROR_M = 0.003
 START_GAP_M = 0.01
+IN_PICTURE = 0.9
+"""Least share of an object's vertices within the picture's border, in every frame."""
 RESOLUTION_DIGITS = 5
 """Poses are kept to 10 micrometres, so that what rests has the same pose in every frame."""
 
@@ -78,7 +81,7 @@ def simulate(settings: Settings, split: str, index: int) -> Trajectory:
     Raises:
         SimError: PyBullet or a model is missing, or no attempt within `max_redraws` was usable.
     """
-    models = object_models(settings.objects, settings.objects_root)
+    models = object_models(settings.objects, settings.objects_root, settings.image_size)
     reasons: list[str] = []
     for attempt in range(settings.max_redraws + 1):
         spec = sample(settings, split, index, attempt)
@@ -155,7 +158,8 @@ def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[Ob
     knots = np.linspace(0, 1, len(path))
     angles = np.stack([np.interp(share, knots, path[:, joint]) for joint in range(7)], axis=1)
     stops = np.round(np.linspace(0, steps, settings.frames)).astype(int)
-    count = len(spec.objects)
+    used = [models[placement.class_index] for placement in spec.objects]
+    count = len(used)
     frames: list[tuple[np.ndarray, ...]] = []
     arm_contact, object_contact = np.zeros(count, dtype=bool), np.zeros((count, count), dtype=bool)
     step = 0
@@ -168,7 +172,7 @@ def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[Ob
             object_contact |= met
             step += 1
         poses = world.poses()
-        _check(settings, poses, models, spec)
+        _check(settings, poses, used)
         frames.append((poses, world.joints(), world.gripper(), arm_contact.copy(), object_contact.copy()))
         arm_contact[:], object_contact[:] = False, False
     poses, joints, gripper, arm, other = (np.stack(column) for column in zip(*frames, strict=True))
@@ -176,12 +180,15 @@ def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[Ob
     return Episode(poses.astype(np.float32), joints.astype(np.float32), gripper.astype(np.float32), arm, other)
 
 
-def _check(settings: Settings, poses: np.ndarray, models: tuple[ObjectModel, ...], spec: Spec) -> None:
-    if (poses[:, 2] < 0).any():
-        raise Unusable("an object left the table")
-    pixels, _ = settings.camera.project(poses[:, :3], settings.image_size)
-    if (pixels < 0.04 * settings.image_size).any() or (pixels > 0.96 * settings.image_size).any():
-        raise Unusable("an object left the picture")
+def _check(settings: Settings, poses: np.ndarray, models: list[ObjectModel]) -> None:
+    for model, pose in zip(models, poses, strict=True):
+        points = model.vertices @ rotation(pose[3:]).T + pose[:3]
+        if points[:, 2].max() < 0 or (pose[:2] < TABLE_LOW_M).any() or (pose[:2] > TABLE_HIGH_M).any():
+            raise Unusable("an object left the table")
+        pixels, _ = settings.camera.project(points, settings.image_size)
+        inside = (pixels >= 0).all(axis=1) & (pixels < settings.image_size).all(axis=1)
+        if inside.mean() < IN_PICTURE:
+            raise Unusable("an object left the picture")
 
 
 def _label(settings: Settings, spec: Spec, episode: Episode, models: tuple[ObjectModel, ...]) -> Trajectory:

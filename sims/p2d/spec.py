@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sims.assets import ObjectModel
+from sims.assets import ObjectModel, object_models
 from sims.errors import SimError
 from sims.p2d.settings import Settings
 
@@ -16,7 +16,17 @@ MARGIN_M = 0.015
 """Least distance between the footprints of two objects, and of an object and the gripper at its start."""
 GRIPPER_M = (0.07, 0.21)
 """Footprint of the hand along and across its fingers' closing plane."""
+YAW_RAD = 0.6
+"""The gripper is turned by at most this about the vertical."""
 MIN_LINE_M = 0.2
+LINE_MARGIN_M = 0.06
+"""Lines may leave the objects' workspace by this."""
+RUN_UP_M = (0.12, 0.24)
+RUN_ON_M = (0.06, 0.16)
+"""How far before and behind the middle of its target an aimed line starts and ends."""
+BORDER = 0.015
+"""Least distance of an object from the picture's border, as a share of its side."""
+DROP_M = 0.0005
 TRIES = 200
 
 
@@ -53,90 +63,109 @@ class Spec:
     aimed: bool
 
 
-def generator(settings: Settings, split: str, index: int, attempt: int) -> np.random.Generator:
-    """The stream of random numbers of one attempt; splits never share one."""
+def generator(settings: Settings, split: str, index: int, attempt: int | None = None) -> np.random.Generator:
+    """The stream of random numbers of one attempt, or (None) of what all attempts share; splits never share one."""
     name = int.from_bytes(hashlib.sha256(split.encode()).digest()[:8], "little")
-    return np.random.default_rng(np.random.SeedSequence([settings.seed, name, index, attempt]))
+    stream = 0 if attempt is None else attempt + 1
+    return np.random.default_rng(np.random.SeedSequence([settings.seed, name, index, stream]))
 
 
 def sample(settings: Settings, split: str, index: int, attempt: int = 0) -> Spec:
     """Draw one attempt at a trajectory.
 
-    Raises:
-        SimError: no arrangement fits into the workspace.
-    """
-    from sims.assets import object_models
+    How many objects, of which classes, and whether the line is aimed are the same for all attempts of a trajectory, so
+    that what is drawn again does not shift their shares; places, directions and the line are drawn anew.
 
-    models = object_models(settings.objects, settings.objects_root)
+    Raises:
+        SimError: no arrangement fits into the workspace and the picture.
+    """
+    models = object_models(settings.objects, settings.objects_root, settings.image_size)
+    shared = generator(settings, split, index)
+    count = int(shared.integers(settings.min_objects, settings.max_objects + 1))
+    classes = [int(number) for number in shared.choice(len(models), size=count, replace=False)]
+    aimed = bool(shared.random() < settings.aim)
     rng = generator(settings, split, index, attempt)
     for _ in range(TRIES):
-        spec = _draw(settings, models, rng, split, index, attempt)
-        if spec is not None:
-            return spec
+        objects = _place(settings, models, classes, rng)
+        line = None if objects is None else _line(settings, objects, aimed, rng)
+        if objects is not None and line is not None:
+            start, end, yaw = line
+            placements = tuple(each.placement for each in objects)
+            return Spec(split, index, attempt, placements, start, end, settings.height_m, yaw, aimed)
+    names = ", ".join(models[number].name for number in classes)
     raise SimError(
-        f"No arrangement of {settings.max_objects} objects was found in workspace_x {settings.workspace_x}, workspace_y "
-        f"{settings.workspace_y}: make the workspace larger or max_objects smaller."
+        f"No arrangement of {names} with a line for the arm was found in workspace_x {settings.workspace_x}, workspace_y "
+        f"{settings.workspace_y} and the camera's picture: make the workspace larger, move the camera back, or lower "
+        f"max_objects {settings.max_objects}."
     )
 
 
-def _draw(
-    settings: Settings, models: tuple[ObjectModel, ...], rng: np.random.Generator, split: str, index: int, attempt: int
-) -> Spec | None:
-    count = int(rng.integers(settings.min_objects, settings.max_objects + 1))
-    classes = rng.choice(len(models), size=count, replace=False)
-    low = np.array([settings.workspace_x[0], settings.workspace_y[0]])
-    high = np.array([settings.workspace_x[1], settings.workspace_y[1]])
-    placed: list[Placement] = []
-    outlines: list[np.ndarray] = []
+@dataclass(frozen=True)
+class _Placed:
+    placement: Placement
+    outline: np.ndarray
+    """(4, 2) rectangle around the object on the table."""
+
+
+def _place(
+    settings: Settings, models: tuple[ObjectModel, ...], classes: list[int], rng: np.random.Generator
+) -> list[_Placed] | None:
+    """Put the objects into the workspace one by one, whole in the picture and apart from each other."""
+    placed: list[_Placed] = []
     for class_index in classes:
-        for _ in range(20):
-            placement, outline = _put(models[class_index], int(class_index), rng, low, high)
-            if all(separate(outline, other, MARGIN_M) for other in outlines):
-                placed.append(placement)
-                outlines.append(outline)
+        for _ in range(30):
+            candidate = _put(settings, models[class_index], class_index, rng)
+            if candidate is not None and all(separate(candidate.outline, other.outline, MARGIN_M) for other in placed):
+                placed.append(candidate)
                 break
         else:
             return None
-    aimed = bool(rng.random() < settings.aim)
-    for _ in range(20):
-        start, end = _line(rng, low, high, placed[int(rng.integers(count))] if aimed else None)
-        yaw = float(rng.uniform(-np.pi / 3, np.pi / 3))
-        hand = rectangle(start, GRIPPER_M, yaw)
-        if np.linalg.norm(end - start) >= MIN_LINE_M and all(separate(hand, other, MARGIN_M) for other in outlines):
-            return Spec(split, index, attempt, tuple(placed), _pair(start), _pair(end), settings.height_m, yaw, aimed)
-    return None
+    return placed
 
 
-def _pair(point: np.ndarray) -> tuple[float, float]:
-    return float(point[0]), float(point[1])
-
-
-def _put(
-    model: ObjectModel, class_index: int, rng: np.random.Generator, low: np.ndarray, high: np.ndarray
-) -> tuple[Placement, np.ndarray]:
-    """A random rest, place and direction, and the rectangle around the object's outline on the table (4, 2)."""
-    name, roll, pitch = model.rests[int(rng.integers(len(model.rests)))]
+def _put(settings: Settings, model: ObjectModel, class_index: int, rng: np.random.Generator) -> _Placed | None:
+    """A random rest, place and direction; None when the picture cuts it off."""
+    name, resting = model.rests[int(rng.integers(len(model.rests)))]
     yaw = float(rng.uniform(-np.pi, np.pi))
-    centre = rng.uniform(low, high)
-    turned = Rotation.from_euler("xy", [roll, pitch]).apply(model.vertices)
-    quaternion = (Rotation.from_euler("z", yaw) * Rotation.from_euler("xy", [roll, pitch])).as_quat()
-    outline = rectangle(centre, np.ptp(turned[:, :2], axis=0), yaw)
-    position = (float(centre[0]), float(centre[1]), float(-turned[:, 2].min()) + 0.002)
-    x, y, z, w = (float(value) for value in quaternion)
-    return Placement(class_index, name, position, (x, y, z, w)), outline
+    (x_low, x_high), (y_low, y_high) = settings.workspace_x, settings.workspace_y
+    centre = rng.uniform([x_low, y_low], [x_high, y_high])
+    orientation = Rotation.from_euler("z", yaw) * Rotation.from_quat(resting)
+    lowest = float(Rotation.from_quat(resting).apply(model.touching)[:, 2].min())
+    position = np.array([*centre, DROP_M - lowest])
+    pixels, _ = settings.camera.project(orientation.apply(model.vertices) + position, settings.image_size)
+    border = BORDER * settings.image_size
+    if (pixels < border).any() or (pixels > settings.image_size - border).any():
+        return None
+    footprint = Rotation.from_quat(resting).apply(model.vertices)[:, :2]
+    outline = rectangle(centre, np.ptp(footprint, axis=0), yaw)
+    quaternion = tuple(float(value) for value in orientation.as_quat())
+    place = tuple(float(value) for value in position)
+    return _Placed(Placement(class_index, name, place, quaternion), outline)  # type: ignore[arg-type]
 
 
 def _line(
-    rng: np.random.Generator, low: np.ndarray, high: np.ndarray, target: Placement | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Start and end (2,) of a line in the workspace, through the target's centre where there is one."""
-    start = rng.uniform(low, high)
-    if target is None:
-        return start, rng.uniform(low, high)
-    through = np.array(target.position[:2])
-    reach = rng.uniform(0.05, 0.2)
-    direction = (through - start) / max(float(np.linalg.norm(through - start)), 1e-9)
-    return start, np.clip(through + reach * direction, low, high)
+    settings: Settings, objects: list[_Placed], aimed: bool, rng: np.random.Generator
+) -> tuple[tuple[float, float], tuple[float, float], float] | None:
+    """Start, end and gripper yaw of a line whose start is clear of all objects; aimed, it runs over one's middle."""
+    low = np.array([settings.workspace_x[0], settings.workspace_y[0]]) - LINE_MARGIN_M
+    high = np.array([settings.workspace_x[1], settings.workspace_y[1]]) + LINE_MARGIN_M
+    for _ in range(40):
+        yaw = float(rng.uniform(-YAW_RAD, YAW_RAD))
+        if aimed:
+            target = np.array(objects[int(rng.integers(len(objects)))].placement.position[:2])
+            angle = rng.uniform(-np.pi, np.pi)
+            direction = np.array([np.cos(angle), np.sin(angle)])
+            start = target - rng.uniform(*RUN_UP_M) * direction
+            end = target + rng.uniform(*RUN_ON_M) * direction
+        else:
+            start, end = rng.uniform(low, high), rng.uniform(low, high)
+        ends = np.stack([start, end])
+        if (ends < low).any() or (ends > high).any() or np.linalg.norm(end - start) < MIN_LINE_M:
+            continue
+        hand = rectangle(start, GRIPPER_M, yaw)
+        if all(separate(hand, each.outline, MARGIN_M) for each in objects):
+            return (float(start[0]), float(start[1])), (float(end[0]), float(end[1])), yaw
+    return None
 
 
 def rectangle(centre: np.ndarray, sides: tuple[float, float] | np.ndarray, yaw: float) -> np.ndarray:
