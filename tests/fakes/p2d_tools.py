@@ -1,4 +1,4 @@
-"""What the tests of the P2D folder share: small settings, the bytes of a folder, generators as processes of their own."""
+"""What the tests of the P2D folder share: small settings, a folder's bytes, generators as processes of their own."""
 
 from __future__ import annotations
 

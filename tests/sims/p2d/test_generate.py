@@ -111,7 +111,7 @@ def test_what_an_exception_in_a_worker_said_is_told(tmp_path: Path, monkeypatch:
 
 def test_what_the_simulator_refuses_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("FAKE_REFUSE", "train-0")
-    with pytest.raises(SimError, match="^the fake does not like this one$"):
+    with pytest.raises(SimError, match=r"^the fake does not like this one$"):
         make(tmp_path)
 
 

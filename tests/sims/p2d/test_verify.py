@@ -253,5 +253,5 @@ def test_a_damaged_note_of_the_last_check_is_no_note(root: Path):
 def test_manifest_and_journal_both_damaged_is_told(root: Path):
     flip(root / MANIFEST, 5)
     (root / JOURNAL).unlink()
-    with pytest.raises(SimError, match="is damaged and trajectories.jsonl is missing: make the data anew"):
+    with pytest.raises(SimError, match=r"is damaged and trajectories\.jsonl is missing: make the data anew"):
         repair(root, simulator=FAKE)
