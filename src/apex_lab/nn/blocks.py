@@ -57,10 +57,12 @@ class GlimpseEncoder(nn.Module):
 class SubpixelDecoder(nn.Module):
     """CNN from a latent vector to a square picture: 4 x 4, then doubled by sub-pixel convolutions up to `size`.
 
+    The last convolution is a sub-pixel one too, so nothing is computed at full size.
+
     Args:
         latent: length of the latent vector.
         size: side of the picture in pixels, 4 times a power of two.
-        width: channels before the last doubling; each level below has twice as many, at most 4 x.
+        width: channels at half the size; each level below has twice as many, at most 4 x.
         outputs: channels of the picture (linear).
     """
 
@@ -72,10 +74,10 @@ class SubpixelDecoder(nn.Module):
         widths = [width * min(4, 2 ** (doublings - 1 - i)) for i in range(doublings)]
         self.stem = nn.Linear(latent, widths[0] * 16)
         blocks: list[nn.Module] = [nn.Unflatten(1, (widths[0], 4, 4)), nn.CELU()]
-        for inputs, after in zip(widths, [*widths[1:], width], strict=True):
+        for inputs, after in zip(widths[:-1], widths[1:], strict=True):
             blocks += [nn.Conv2d(inputs, 4 * after, 3, padding=1), nn.PixelShuffle(2), group_norm(after), nn.CELU()]
         self.blocks = nn.Sequential(*blocks)
-        self.head = nn.Conv2d(width, outputs, 3, padding=1)
+        self.head = nn.Sequential(nn.Conv2d(width, 4 * outputs, 3, padding=1), nn.PixelShuffle(2))
 
     def forward(self, latent: Float[Tensor, "N latent"]) -> Float[Tensor, "N outputs size size"]:
         return self.head(self.blocks(self.stem(latent)))
@@ -89,7 +91,7 @@ class BroadcastDecoder(nn.Module):
         size: side of the picture in pixels.
         width: channels.
         outputs: channels of the picture (linear).
-        coarse: the grid is `size / coarse`; a power of two.
+        coarse: the grid is `size / coarse`; a power of two, at least 2.
     """
 
     def __init__(self, latent: int, size: int, width: int, outputs: int, coarse: int = 8) -> None:
@@ -100,10 +102,10 @@ class BroadcastDecoder(nn.Module):
         self.stem = nn.Linear(latent, width)
         self.place = nn.Conv2d(2, width, 1)
         blocks: list[nn.Module] = [nn.CELU(), nn.Conv2d(width, width, 3, padding=1), nn.CELU()]
-        for _ in range(round(math.log2(coarse))):
+        for _ in range(round(math.log2(coarse)) - 1):
             blocks += [nn.Conv2d(width, 4 * width, 3, padding=1), nn.PixelShuffle(2), nn.CELU()]
         self.blocks = nn.Sequential(*blocks)
-        self.head = nn.Conv2d(width, outputs, 3, padding=1)
+        self.head = nn.Sequential(nn.Conv2d(width, 4 * outputs, 3, padding=1), nn.PixelShuffle(2))
 
     def forward(self, latent: Float[Tensor, "N latent"]) -> Float[Tensor, "N outputs size size"]:
         axis = pixel_centres(self.grid, latent)

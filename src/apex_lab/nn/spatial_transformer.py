@@ -68,8 +68,14 @@ class Paster:
         self.w_x = paste_weights(s_x, t_x, glimpse, size)
 
     def each(self, glimpses: Float[Tensor, "... C g g"]) -> Float[Tensor, "... C size size"]:
-        """Every glimpse in an image of its own."""
-        return self.w_y.transpose(-1, -2).unsqueeze(-3) @ (glimpses @ self.w_x.unsqueeze(-3))
+        """Every glimpse in an image of its own.
+
+        Channels ride along as extra columns, then as extra rows, so each window takes two plain matrix products.
+        """
+        channels = glimpses.shape[-3]
+        rows = self.w_y.transpose(-1, -2) @ glimpses.transpose(-3, -2).flatten(-2)
+        image = rows.unflatten(-1, (channels, -1)).flatten(-3, -2) @ self.w_x
+        return image.unflatten(-2, (-1, channels)).transpose(-3, -2)
 
     def total(self, glimpses: Float[Tensor, "... K g g"]) -> Float[Tensor, "... size size"]:
         """All K glimpses summed in one image, without making the K images (`self` has windows (..., K, 4))."""

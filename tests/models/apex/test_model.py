@@ -21,7 +21,7 @@ from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.spatial_transformer import Paster, pixel_centres
 from apex_lab.scene import Scene, schedule_at
 
-SCHEDULE = schedule_at({"temperature": 0.7, "discovery_presence": 0.1})
+SCHEDULE = schedule_at({"temperature": 0.7, "discovery_presence": 0.1, "carry": 1.0})
 
 
 def tiny(**changes: object) -> Apex:

@@ -12,12 +12,14 @@ from apex_lab.models.apex.glimpses import FeatureGlimpses, ImageGlimpses
 from apex_lab.models.apex.likelihood import GaussianLikelihood, MixtureLikelihood
 from apex_lab.models.apex.masks import ApexNormalisation, ScalorNormalisation
 from apex_lab.models.apex.model import Apex
+from apex_lab.models.apex.objective import DiscoveryPrior
 
 __all__ = [
     "Apex",
     "ApexEncoder",
     "ApexNormalisation",
     "Background",
+    "DiscoveryPrior",
     "FeatureGlimpses",
     "GaussianLikelihood",
     "ImageGlimpses",

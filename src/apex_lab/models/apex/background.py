@@ -52,9 +52,11 @@ class Background(nn.Module):
             return
         with torch.no_grad():
             self.bias_image.copy_(torch.logit(median, eps=0.02))
-            self.decoder.head.weight.mul_(0.1)
-            assert self.decoder.head.bias is not None
-            self.decoder.head.bias.zero_()
+            last = self.decoder.head[0]
+            assert isinstance(last, nn.Conv2d)
+            assert last.bias is not None
+            last.weight.mul_(0.1)
+            last.bias.zero_()
 
     def posterior(self, mask: Float[Tensor, "N H W"], image: Float[Tensor, "N 3 H W"]) -> Gaussian:
         """q(z_bg | m_bg, x): a CNN on the background mask and the image."""

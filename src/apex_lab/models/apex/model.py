@@ -68,7 +68,7 @@ class Apex(SceneModel):
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
-    schedule_names = ("temperature", "discovery_presence")
+    schedule_names = ("temperature", "discovery_presence", "carry")
 
     def __init__(
         self,
@@ -123,7 +123,8 @@ class Apex(SceneModel):
 
         Args:
             video: RGB in [0, 1].
-            schedule: `temperature` of the relaxed Bernoulli, `discovery_presence` p0.
+            schedule: `temperature` of the relaxed Bernoulli; `discovery_presence` p0; `carry`, the probability in
+                [0, 1] with which a video's objects are carried into the next frame in training (see `_carried_on`).
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
@@ -193,8 +194,20 @@ class Apex(SceneModel):
                     kept.ids,
                 )
             )
-            state, valid, ids, next_id = candidates.gather(kept.source), kept.valid, kept.ids, kept.next_id
+            state, ids, next_id = candidates.gather(kept.source), kept.ids, kept.next_id
+            valid = kept.valid & self._carried_on(b, schedule)
         return stack_steps(steps)
+
+    def _carried_on(self, batch: int, schedule: Schedule) -> Tensor:
+        """Which videos carry their objects into the next frame, (B, 1); all in evaluation.
+
+        A curriculum over sequence length without another shape: with probability 1 - carry a video starts afresh, so
+        at 0 all frames are images that discovery explains alone, at 1 videos are whole. Propagation learns from
+        objects that exist; carried false ones of the first steps only teach it that objects should vanish.
+        """
+        if not self.training:
+            return torch.ones(batch, 1, dtype=torch.bool, device=schedule["carry"].device)
+        return torch.rand(batch, 1, device=schedule["carry"].device) < schedule["carry"]
 
     def _found(self, proposals: Proposals, frame: int, pres: Tensor, top: Tensor) -> Objects:
         """The rendered discoveries of a frame as objects; their other recurrent states start at zero."""
@@ -264,8 +277,10 @@ class Apex(SceneModel):
         what = held(steps.what) * carried[..., None]
         blend = (masks.objects[..., None, :, :] * means).sum(2) + masks.background[..., None, :, :] * backdrop
         live = carried.sum(-1).clamp_min(1)
+        alive = steps.valid[..., : self.max_objects]
+        kept = (alive * steps.propagated.q_pres).sum() / alive.sum().clamp_min(1)
         return Scene(
-            masks=torch.cat([objects, 1 - objects.sum(2, keepdim=True)], dim=2),
+            masks=torch.cat([objects, (1 - objects.sum(2, keepdim=True)).clamp_min(0)], dim=2),
             background=torch.arange(self.max_objects + 1, device=carried.device) == self.max_objects,
             ids=torch.cat([steps.ids, torch.full_like(steps.ids[..., :1], BACKGROUND_ID)], dim=-1),
             presence=torch.cat([presence, torch.ones_like(presence[..., :1])], dim=-1),
@@ -279,5 +294,7 @@ class Apex(SceneModel):
                 "foreground": masks.foreground.mean(),
                 "window_size": (window[..., :2].mean(-1).nan_to_num().sum(-1) / live).mean(),
                 "discovery_prob": steps.discovery_prob.mean(),
+                "propagated_prob": kept,
+                "propagated_share": (carried & (steps.source < self.max_objects)).sum() / carried.sum().clamp_min(1),
             },
         )

@@ -82,6 +82,12 @@ class Appearance(nn.Module):
         self.what = what
         self.rnn = nn.GRUCell(code + what, hidden)
         self.head = nn.Linear(hidden, 2 * what)
+        # Start as a network without memory: then a propagated object looks just as it would if it were discovered in
+        # its window, and its presence does not die before propagation has learned anything.
+        with torch.no_grad():
+            self.rnn.weight_ih[:, code:] = 0
+            self.rnn.weight_hh.zero_()
+            self.rnn.bias_ih[hidden : 2 * hidden] = -3.0  # update gate: take the new state
 
     def forward(self, code: Tensor, what: Tensor, hidden: Tensor) -> tuple[Gaussian, Tensor]:
         """(N, code), (N, Z), (N, hidden) -> q(z_what), new hidden state."""
