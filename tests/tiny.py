@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, Subset
 
 from apex_lab.scene import Scene, SceneModel, Schedule
 
@@ -22,6 +22,8 @@ class Layers(SceneModel):
 
     term_names = ("error", "spread")
     schedule_names = ("noise",)
+
+    base: Tensor
 
     def __init__(self, components: Count = 3, width: Count = 8, fail_at: int | None = None) -> None:
         super().__init__()
@@ -123,8 +125,7 @@ class SquaresModule:
     def train_dataloader(self) -> DataLoader[dict[str, Any]]:
         return DataLoader(self.sets["train"], batch_sampler=list(self._order()))
 
-    def val_dataloader(self) -> DataLoader[dict[str, Any]]:
-        return DataLoader(self.sets["val"], batch_size=self.batch_size)
-
-    def test_dataloader(self) -> DataLoader[dict[str, Any]]:
-        return DataLoader(self.sets["test"], batch_size=self.batch_size)
+    def loader(self, split: str, videos: int | None = None) -> DataLoader[dict[str, Any]]:
+        data = self.sets[split]
+        chosen = range(len(data) if videos is None else min(videos, len(data)))
+        return DataLoader(Subset(data, chosen), batch_size=self.batch_size)

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as Bar
 
 from apex_lab import checkpoints, console
+from apex_lab.interrupts import Deferred
 from apex_lab.learner import Learner
 from apex_lab.runs import Run
 
@@ -29,6 +30,7 @@ class Checkpoints(L.Callback):
         max_steps: the last step, always stored.
         monitor: name of the validation score.
         mode: which end of it is best.
+        deferred: a request to stop, acted on when the step at hand is stored.
         training: `training` entry of the checkpoint that this run goes on from.
     """
 
@@ -40,6 +42,7 @@ class Checkpoints(L.Callback):
         max_steps: int,
         monitor: str,
         mode: Literal["max", "min"],
+        deferred: Deferred,
         training: dict[str, Any] | None = None,
     ) -> None:
         self._run = run
@@ -48,6 +51,7 @@ class Checkpoints(L.Callback):
         self._max_steps = max_steps
         self._monitor = monitor
         self._sign = 1.0 if mode == "max" else -1.0
+        self._deferred = deferred
         self._best: float | None = training["best"] if training else None
         self._seconds_before: float = training["seconds"] if training else 0.0
         self._start = time.monotonic()
@@ -57,8 +61,10 @@ class Checkpoints(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
         assert isinstance(learner, Learner)
-        if learner.step % self._interval == 0 and not self._validation_due(learner.step):
+        asked = self._deferred.signum is not None
+        if (asked or learner.step % self._interval == 0) and not self._validation_due(learner.step):
             self._save_last(learner)
+            self._deferred.act()
 
     def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
@@ -68,6 +74,7 @@ class Checkpoints(L.Callback):
             self._best = value
             checkpoints.save(self._run.best, {**self._content(learner), "training": None})
         self._save_last(learner)
+        self._deferred.act()
 
     def on_train_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)

@@ -6,13 +6,12 @@ that the third of four jobs' misspelt value is found before the first one starts
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
-import signal
+import shlex
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,23 +27,16 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab import console
-from apex_lab.components import did_you_mean, one_line
 from apex_lab.config import conf_dir, plain
 from apex_lab.errors import UserError
+from apex_lab.interrupts import Interrupted, interruptible
+from apex_lab.validation import did_you_mean, one_line, sentence
 
 Check = Callable[[dict[str, Any], dict[str, str], Sequence[str]], Any]
 """(plain configuration, group -> word, overrides) -> a checked job; raises UserError."""
 
 CONFIG_ERROR = 2
 RUN_ERROR = 1
-
-
-class Interrupted(BaseException):
-    """Somebody asked the process to stop (Ctrl-C, SIGTERM); nothing is wrong."""
-
-    def __init__(self, signum: int) -> None:
-        super().__init__(signal.Signals(signum).name)
-        self.signum = signum
 
 
 def launch(config_name: str, check: Check, work: Callable[[Any], None], title: Callable[[Any], str]) -> None:
@@ -78,7 +70,7 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
 
     sys.argv[1:] = _options_last(sys.argv[1:])
     try:
-        with _interruptible():
+        with interruptible():
             _preflight(config_name, check)
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(task)()
     except UserError as error:
@@ -94,38 +86,54 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
         sys.exit(RUN_ERROR)
 
 
-def compose_jobs(
-    config_name: str, overrides: Sequence[str], multirun: bool, config_folder: str | None = None
-) -> Iterator[tuple[dict[str, Any], dict[str, str], list[str]]]:
-    """Composes every job of a command: (plain configuration, group -> word, overrides without sweeps).
+def _preflight(config_name: str, check: Check) -> None:
+    """Composes and checks every job of the command line, unless it only asks for help or for the configuration.
 
     Raises:
-        UserError: what Hydra refuses, in one sentence.
+        UserError: what Hydra or the check refuses, in one sentence.
     """
-    extra = [f"hydra.searchpath=[file://{Path(config_folder).resolve()}]"] if config_folder else []
-    with _one_sentence(), initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        for job in _expand(overrides) if multirun else [list(overrides)]:
-            try:
-                config = compose(config_name, overrides=[*extra, *job], return_hydra_config=True)
-            except (HydraException, OmegaConfBaseException) as error:
-                raise UserError(_told(error, config_name, job)) from error
-            choices = _choices(config.hydra.runtime.choices)
-            with_own_keys = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-            yield plain(with_own_keys), choices, job
-
-
-def _preflight(config_name: str, check: Check) -> None:
-    """Composes and checks every job of the command line, unless it only asks for help or for the configuration."""
     arguments = get_args_parser().parse_args()
-    asks = arguments.help or arguments.hydra_help or arguments.info or arguments.shell_completion
-    if asks or arguments.config_path:
+    if arguments.multirun and (arguments.cfg or arguments.info):
+        raise UserError("-m cannot stand beside --cfg or --info: leave it out to see one job's configuration.")
+    if arguments.help or arguments.hydra_help or arguments.info or arguments.shell_completion or arguments.cfg:
         return
-    jobs = compose_jobs(
-        arguments.config_name or config_name, arguments.overrides, arguments.multirun, arguments.config_dir
-    )
-    for raw, choices, overrides in jobs:
-        if not arguments.cfg:
-            check(raw, choices, overrides)
+    extra = []
+    if arguments.config_dir is not None:
+        if not Path(arguments.config_dir).is_dir():
+            raise UserError(f"--config-dir {arguments.config_dir} is not a folder.")
+        extra = [f"hydra.searchpath=[file://{Path(arguments.config_dir).resolve()}]"]
+    name = arguments.config_name or config_name
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(version_base="1.3", config_dir=arguments.config_path or str(conf_dir())):
+            for overrides in _expand(arguments.overrides) if arguments.multirun else [arguments.overrides]:
+                _check_composed(name, extra, overrides, check)
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(_told(error, arguments.overrides)) from error
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def _check_composed(name: str, extra: Sequence[str], overrides: Sequence[str], check: Check) -> None:
+    """Composes one job and checks it."""
+
+    def attempt(words: Sequence[str]) -> None:
+        config = compose(name, overrides=[*extra, *words], return_hydra_config=True)
+        choices = _choices(config.hydra.runtime.choices)
+        own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        check(plain(own), choices, overrides)
+
+    try:
+        attempt(overrides)
+    except HydraException as error:
+        absent = re.match(r"Could not override '([^']+)'\.\s+To append to your config", str(error))
+        if absent is None:
+            raise
+        # Hydra only knows that no file sets the key; the check knows whether it exists and what is close to it
+        key = absent.group(1)
+        attempt([f"++{word}" if word.startswith(f"{key}=") else word for word in overrides])
+        word = next(word for word in overrides if word.startswith(f"{key}="))
+        raise UserError(f"{key} is set by no file that was chosen: write ++{word} to add it.") from error
 
 
 def _expand(overrides: Sequence[str]) -> list[list[str]]:
@@ -156,73 +164,28 @@ def _options_last(arguments: Sequence[str]) -> list[str]:
     return [*early, *late, *options]
 
 
-@contextlib.contextmanager
-def _one_sentence() -> Iterator[None]:
-    """Turns Hydra's errors outside of composition (a malformed sweep) into `UserError`."""
-    GlobalHydra.instance().clear()
-    try:
-        yield
-    except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(_told(error, "", [])) from error
-    finally:
-        GlobalHydra.instance().clear()
-
-
-def _told(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
+def _told(error: Exception, overrides: Sequence[str]) -> str:
     """What Hydra or OmegaConf says in several lines, as one sentence with the key, the value and what to do."""
     text = str(error)
+    given = {word.split("=", 1)[0].lstrip("+~"): word.lstrip("+~") for word in overrides}
     if isinstance(error, MissingConfigException) and error.options is not None:
         group, _, word = str(error.missing_cfg_file).rpartition("/")
-        return (
-            f"{group}={word}: there is no such choice{did_you_mean(word, error.options)} ({', '.join(error.options)})."
-        )
+        guess = did_you_mean(word, error.options)
+        return sentence(f"{group}={word}: there is no such choice in {', '.join(error.options)}{guess}")
     if isinstance(error, OverrideParseException):
-        return f"{error.override!r} cannot be read: {one_line(Exception(text.splitlines()[0]))}."
-    no_group = re.match(r"Could not override '([^']+)'\.\s+No match in the defaults list", text)
-    if no_group:
-        word = no_group.group(1)
-        return f"{word}=... names no default choice: write +{word}=... to add it."
-    unknown = re.search(r"Could not override '([^']+)'", text)
-    if unknown:
-        key = unknown.group(1)
-        value = next((o.split("=", 1)[1] for o in overrides if o.split("=", 1)[0].strip("+~") == key), None)
-        given = f" = {value}" if value is not None else ""
-        return f"Unknown key {key}{given}{did_you_mean(key, _known_keys(config_name))}."
-    return f"{one_line(Exception(text))}."
-
-
-def _known_keys(config_name: str) -> list[str]:
-    """All keys of the configuration without overrides, dotted."""
-
-    def walk(value: object, prefix: str) -> Iterator[str]:
-        if isinstance(value, dict):
-            for name, item in value.items():
-                yield f"{prefix}{name}"
-                yield from walk(item, f"{prefix}{name}.")
-
-    config = compose(config_name)
-    return list(walk(OmegaConf.to_container(config, resolve=False), ""))
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Makes Ctrl-C and SIGTERM raise `Interrupted`, which nothing on the way takes for an error."""
-
-    def stop(signum: int, _frame: object) -> None:
-        raise Interrupted(signum)
-
-    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        return sentence(f"'{error.override}' cannot be read as key=value: {text.splitlines()[0]}")
+    unlisted = re.match(r"Could not override '([^']+)'\.\s+No match in the defaults list", text)
+    if unlisted:
+        word = given.get(unlisted.group(1), unlisted.group(1))
+        return f"{word} has no default to replace: write +{word}."
+    there = re.match(r"Could not append to config\. An item is already at '([^']+)'", text)
+    if there:
+        return f"{there.group(1)} is there already: write {given.get(there.group(1), there.group(1))} without the +."
+    return sentence(text)
 
 
 def command_line() -> str:
     """The command that started this process, as one can type it again."""
-    import shlex
-
     program = Path(sys.argv[0])
     if program.suffix == ".py" and program.parent.name == "apex_lab":
         words = ["python", "-m", f"apex_lab.{program.stem}"]

@@ -13,10 +13,11 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from apex_lab import components
-from apex_lab.components import did_you_mean, is_node, one_line
+from apex_lab.components import is_node
 from apex_lab.errors import UserError
 from apex_lab.scene import SceneModel
 from apex_lab.schedules import Constant
+from apex_lab.validation import did_you_mean, sentence, shown, validate
 
 
 def conf_dir() -> Path:
@@ -113,18 +114,31 @@ class Job:
 
 
 def plain(config: DictConfig) -> dict[str, Any]:
-    """A composed configuration as plain containers, all interpolations resolved.
+    """A composed configuration as plain containers, all interpolations resolved; `???` stays where a value is missing.
 
     Raises:
-        UserError: a value that must be given is missing, or an interpolation leads nowhere.
+        UserError: an interpolation leads nowhere.
     """
     try:
-        container = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+        container = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
     except OmegaConfBaseException as error:
         key = f"{error.full_key}: " if error.full_key else ""
-        raise UserError(f"{key}{one_line(Exception(str(error.msg).splitlines()[0]))}.") from error
+        raise UserError(sentence(key + str(error.msg).splitlines()[0])) from error
     assert isinstance(container, dict)
     return {str(key): value for key, value in container.items()}
+
+
+def refuse_missing(raw: Mapping[str, Any], prefix: str = "") -> None:
+    """Looks for values that a file leaves to the command line.
+
+    Raises:
+        UserError: one was not given.
+    """
+    for key, value in raw.items():
+        if value == "???":
+            raise UserError(f"{prefix}{key} is missing: write {prefix}{key}=...")
+        if isinstance(value, Mapping):
+            refuse_missing(value, f"{prefix}{key}.")
 
 
 def check_job(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str] = ()) -> Job:
@@ -137,11 +151,27 @@ def check_job(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequen
         UserError: the sentence.
     """
     raw = {key: value for key, value in raw.items() if key != "hydra"}
-    config = components.validate(Config, raw, "")
+    groups = [folder.name for folder in conf_dir().iterdir() if folder.is_dir()]
+    config = validate(Config, raw, "", also_known=groups)
     assert isinstance(config, Config)
+    refuse_missing(raw)
     _check_components(config)
     _check_objective(config)
+    device(config.trainer.accelerator)
     return Job(config, raw, dict(choices), tuple(overrides))
+
+
+def device(accelerator: str) -> torch.device:
+    """The device that `trainer.accelerator` asks for.
+
+    Raises:
+        UserError: a GPU is asked for and there is none.
+    """
+    if accelerator == "gpu" and not torch.cuda.is_available():
+        raise UserError(
+            "trainer.accelerator = 'gpu', but PyTorch finds no CUDA device: use trainer=cpu or trainer=auto."
+        )
+    return torch.device("cuda" if accelerator != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 def build_model(config: Config) -> SceneModel:
@@ -197,7 +227,7 @@ def _check_components(config: Config) -> None:
     for name, weight in config.loss.items():
         if isinstance(weight, dict):
             if not is_node(weight):
-                raise UserError(f"loss.{name} = {weight!r} is wrong: give a number or a schedule with a _target_.")
+                raise UserError(f"loss.{name} = {shown(weight)} is wrong: give a number or a schedule with a _target_.")
             components.check(weight, f"loss.{name}")
     for name, node in config.logger.items():
         components.check(node, f"logger.{name}", supplied=["run"])
@@ -225,7 +255,9 @@ def _check_objective(config: Config) -> None:
 def _same_names(key: str, given: Mapping[str, object], wanted: Sequence[str]) -> None:
     for name in given:
         if name not in wanted:
-            raise UserError(f"Unknown key {key}.{name}: the model has {_listed(wanted)}{did_you_mean(name, wanted)}.")
+            raise UserError(
+                sentence(f"Unknown key {key}.{name}: the model has {_listed(wanted)}{did_you_mean(name, wanted)}")
+            )
     for name in wanted:
         if name not in given:
             raise UserError(f"{key}.{name} is missing: the model needs {_listed(wanted)}.")

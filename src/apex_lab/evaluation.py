@@ -2,45 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from apex_lab import provenance
-from apex_lab.files import make_folder, write_json
+from apex_lab.files import make_folder, write_json, write_text
 from apex_lab.learner import Batch, as_float
-from apex_lab.metrics import SceneMetrics, scene_identities
+from apex_lab.metrics import scene_identities
+from apex_lab.metrics.evaluator import Evaluator
 from apex_lab.scene import Scene, SceneModel, Schedule
 from apex_lab.view import Item, render_all
+from apex_lab.view.item import one_video
 
 COLUMNS = {"ari_fg": "ARI-FG", "msc_fg": "MSC-FG", "ari": "ARI", "msc": "MSC"}
 """The paper's segmentation scores: key -> heading."""
 
 
-@dataclass(frozen=True)
-class Scores:
-    """What a model scored on some videos.
-
-    Attributes:
-        total: mean over all frames of all videos, per metric key; NaN where no frame counted.
-        per_video: one row per video.
-        size: how much was scored: `videos`, `frames`, `empty_frames`.
-    """
-
-    total: dict[str, float]
-    per_video: list[dict[str, int | float]]
-    size: dict[str, int]
-
-    def row(self) -> str:
-        """The paper's four numbers under their headings."""
-        head = "".join(f"{heading:>9}" for heading in COLUMNS.values())
-        return head + "\n" + "".join(f"{self.total[key]:9.3f}" for key in COLUMNS)
-
-
-@torch.no_grad()
 def predict(model: SceneModel, batch: Batch, schedule: Schedule, precision: int | str = 32) -> Scene:
     """The scene of a batch that lies on the model's device; a model that reads the ground truth is given it."""
     video = as_float(batch["video"])
@@ -50,49 +30,67 @@ def predict(model: SceneModel, batch: Batch, schedule: Schedule, precision: int 
         return model(video, schedule)
 
 
+@torch.no_grad()
 def evaluate(
     model: SceneModel,
     batches: Iterable[Batch],
     schedule: Schedule,
     device: torch.device,
     precision: int | str = 32,
-    videos: int | None = None,
     pictures: int = 0,
-) -> tuple[Scores, list[Item]]:
+) -> tuple[Evaluator, list[Item]]:
     """Scores a model on batches and keeps the first videos for drawing.
 
     Args:
-        model: left in evaluation mode, on `device`.
+        model: left in evaluation mode on `device`.
         batches: as the learner's; memory does not grow with their number.
         schedule: values the model is called with, on `device`.
         device: where the model runs.
         precision: 32 or "bf16-mixed".
-        videos: how many; None for all.
         pictures: how many of the first videos are kept.
     """
     model.to(device).eval()
-    metrics = SceneMetrics().to(device)
+    evaluator = Evaluator()
     items: list[Item] = []
-    seen = 0
     for batch in batches:
-        if videos is not None and seen >= videos:
-            break
-        batch = _first(batch, None if videos is None else videos - seen, device)
+        batch = {name: value.to(device) for name, value in batch.items()}
         scene = predict(model, batch, schedule, precision)
-        truth = batch["segmentation"].long()
-        metrics.update(scene_identities(scene, truth.shape[-2:]), truth, batch["index"])
-        for b in range(min(len(truth), pictures - len(items))):
-            items.append(_item(batch, scene, b))
-        seen += len(truth)
-    return Scores(metrics.compute(), metrics.per_video(), metrics.size()), items
+        truth = batch["segmentation"].cpu()
+        identities = scene_identities(scene, truth.shape[-2:]).cpu()
+        for b, index in enumerate(batch["index"].tolist()):
+            name = f"video {index}"
+            evaluator.add(f"{index:05d}", identities[b].numpy(), truth[b].numpy())
+            if len(items) < pictures:
+                items.append(Item(name, batch["video"][b : b + 1].cpu(), one_video(scene, b), 0, truth[b : b + 1]))
+    return evaluator, items
 
 
-def store(folder: Path, split: str, scores: Scores, settings: dict[str, Any]) -> Path:
-    """Writes metrics.json: settings, versions, and per split the scores in total and per video."""
+def store(folder: Path, split: str, evaluator: Evaluator, asked: Mapping[str, Any]) -> Path:
+    """Writes metrics.json and objects.csv.
+
+    metrics.json holds `settings` (what was asked for, and how it was scored), `versions`, and under `splits` and the
+    split's name the numbers of videos and frames and the scores in total and per video; an undefined score is null.
+    objects.csv holds a row per true object.
+    """
+    result = evaluator.result()
+    objects = result.pop("per_object")
+    scoring, made_by = result.pop("settings"), result.pop("versions")
+    sizes = {key: result["total"][key] for key in ("videos", "frames")}
     path = make_folder(folder) / "metrics.json"
-    part = {**scores.size, "total": scores.total, "per_video": scores.per_video}
-    write_json(path, {"settings": settings, "versions": provenance.versions(), "splits": {split: part}})
+    write_text(folder / "objects.csv", objects.to_csv(index=False))
+    write_json(
+        path,
+        {"settings": {**asked, "scoring": scoring}, "versions": made_by, "splits": {split: {**sizes, **result}}},
+    )
     return path
+
+
+def summary(split: str, scored: Mapping[str, Any]) -> str:
+    """What was scored, and the paper's four numbers under their headings; `scored` as stored for a split."""
+    values = [scored["total"][key] for key in COLUMNS]
+    numbers = "".join(f"{math.nan if value is None else value:9.3f}" for value in values)
+    head = "".join(f"{heading:>9}" for heading in COLUMNS.values())
+    return f"{split}: {scored['videos']} videos, {scored['frames']} frames\n{head}\n{numbers}"
 
 
 def draw(folder: Path, items: list[Item], curves: Path | None = None) -> list[Path]:
@@ -100,12 +98,3 @@ def draw(folder: Path, items: list[Item], curves: Path | None = None) -> list[Pa
     if not items:
         return []
     return render_all(make_folder(folder), items, curves if curves is not None and curves.is_file() else None)
-
-
-def _first(batch: Batch, count: int | None, device: torch.device) -> dict[str, Any]:
-    """The first videos of a batch on a device."""
-    return {name: value[:count].to(device) for name, value in batch.items() if isinstance(value, torch.Tensor)}
-
-
-def _item(batch: Batch, scene: Scene, b: int) -> Item:
-    return Item(f"video {int(batch['index'][b])}", batch["video"], scene, b, batch["segmentation"])

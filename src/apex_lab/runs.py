@@ -36,6 +36,12 @@ HARMLESS = (
     "paths",
     "logger",
     "callbacks.progress",
+    "data.root",
+    "data.seed",
+    "data.workers",
+    "data.generate",
+    "data.sim_workers",
+    "data.verify",
     "trainer.accelerator",
     "trainer.log_interval",
     "trainer.checkpoint_interval",
@@ -48,11 +54,8 @@ def fingerprint(config: Mapping[str, Any]) -> str:
     """Hexadecimal digest of a resolved configuration without its harmless keys."""
     content = deepcopy(dict(config))
     for key in HARMLESS:
-        *path, last = key.split(".")
-        part: Any = content
-        for name in path:
-            part = part.get(name, {})
-        part.pop(last, None)
+        group, _, name = key.partition(".")
+        (content.get(group) or {} if name else content).pop(name or group, None)
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
 

@@ -6,7 +6,6 @@ python -m apex_lab.train +ablation=no_entropy seed=0,1,2,3 scale=cpu -m
 
 from __future__ import annotations
 
-import math
 import time
 from typing import Any
 
@@ -23,12 +22,15 @@ from apex_lab.config import (
     build_weights,
     check_job,
 )
+from apex_lab.config import device as device_of
 from apex_lab.errors import UserError
 from apex_lab.files import read_json
+from apex_lab.interrupts import Deferred, Interrupted, deferring
 from apex_lab.learner import Learner, Stretches
 from apex_lab.loggers import Curves
 from apex_lab.runs import Run, group_name
 from apex_lab.scene import SceneModel, schedule_at
+from apex_lab.validation import one_line
 
 
 def main() -> None:
@@ -52,7 +54,7 @@ def train(job: Job) -> None:
             console.say(f"finished already: {run.folder}")
             _show(run)
             return
-        device = _device(job.config)
+        device = device_of(job.config.trainer.accelerator)
         run.start(cli.command_line(), device)
         try:
             with console.log_to(run.folder / "log.txt"):
@@ -60,11 +62,11 @@ def train(job: Job) -> None:
         except UserError as error:
             run.fail(str(error))
             raise
-        except cli.Interrupted as stop:
+        except Interrupted as stop:
             run.fail(f"stopped by {stop}")
             raise
         except BaseException as error:
-            run.fail(f"{type(error).__name__}: {components.one_line(error)}")
+            run.fail(f"{type(error).__name__}: {one_line(error)}")
             raise
         run.finish()
         _show(run)
@@ -120,17 +122,27 @@ def _fit(run: Run, model: SceneModel, data: Any, checkpoint: dict[str, Any] | No
     if settings.compile:
         model.compile()
     data.start_step, data.max_steps = start, settings.max_steps
-    validation = settings.validation_interval
-    trainer = L.Trainer(
+    with deferring() as deferred:
+        _trainer(run, start, training, deferred, device).fit(
+            learner,
+            Stretches(data.train_dataloader(), learner, settings.validation_interval),
+            data.loader("val", settings.validation_videos) if settings.validation_interval is not None else None,
+        )
+
+
+def _trainer(
+    run: Run, start: int, training: dict[str, Any] | None, deferred: Deferred, device: torch.device
+) -> L.Trainer:
+    settings = run.job.config.trainer
+    return L.Trainer(
         accelerator="gpu" if device.type == "cuda" else "cpu",
         devices=1,
         precision="bf16-mixed" if settings.precision == "bf16-mixed" else "32-true",
         max_epochs=-1,
         max_steps=settings.max_steps - start,
-        limit_val_batches=_validation_batches(config),
         num_sanity_val_steps=0,
         logger=_loggers(run, start),
-        callbacks=_callbacks(run, training),
+        callbacks=_callbacks(run, training, deferred),
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -138,29 +150,24 @@ def _fit(run: Run, model: SceneModel, data: Any, checkpoint: dict[str, Any] | No
         inference_mode=False,
         default_root_dir=run.folder,
     )
-    batches = Stretches(data.train_dataloader(), learner, validation)
-    trainer.fit(learner, batches, data.val_dataloader() if validation is not None else None)
 
 
 def _evaluate(run: Run, model: SceneModel, data: Any, device: torch.device) -> None:
     """Scores and pictures of the final weights, in the run's folder."""
     config = run.job.config
-    settings = config.evaluation
+    asked = config.evaluation
     schedule = schedule_at({n: s(config.trainer.max_steps) for n, s in build_schedules(config).items()}, device)
     data.setup("test")
-    batches = getattr(data, f"{settings.split}_dataloader")()
-    precision = config.trainer.precision
-    scores, items = evaluation.evaluate(model, batches, schedule, device, precision, settings.videos, settings.pictures)
+    batches = data.loader(asked.split, asked.videos)
+    evaluator, items = evaluation.evaluate(model, batches, schedule, device, config.trainer.precision, asked.pictures)
     evaluation.draw(run.view_folder, items, run.curves_file)
-    evaluation.store(run.folder, settings.split, scores, settings.model_dump())
+    evaluation.store(run.folder, asked.split, evaluator, asked.model_dump())
 
 
 def _show(run: Run) -> None:
     """The row of scores and the pictures' paths."""
-    for split, part in read_json(run.metrics_file)["splits"].items():
-        total = {key: math.nan if value is None else value for key, value in part["total"].items()}
-        scores = evaluation.Scores(total, [], {})
-        console.say(f"{split}: {part['videos']} videos, {part['frames']} frames\n{scores.row()}")
+    for split, scored in read_json(run.metrics_file)["splits"].items():
+        console.say(evaluation.summary(split, scored))
     for path in sorted(run.view_folder.glob("*")):
         console.say(str(path))
 
@@ -207,7 +214,7 @@ def _loggers(run: Run, step: int) -> list[Any]:
     return [Curves(run.curves_file, step), *built]
 
 
-def _callbacks(run: Run, training: dict[str, Any] | None) -> list[L.Callback]:
+def _callbacks(run: Run, training: dict[str, Any] | None, deferred: Deferred) -> list[L.Callback]:
     config = run.job.config
     settings = config.trainer
     keep = callbacks.Checkpoints(
@@ -217,30 +224,10 @@ def _callbacks(run: Run, training: dict[str, Any] | None) -> list[L.Callback]:
         settings.max_steps,
         settings.monitor,
         settings.monitor_mode,
+        deferred,
         training,
     )
     return [keep, *(components.build(node, f"callbacks.{name}") for name, node in config.callbacks.items())]
-
-
-def _validation_batches(config: Config) -> int | float:
-    settings = config.trainer
-    if settings.validation_interval is None:
-        return 0
-    if settings.validation_videos is None:
-        return 1.0
-    return math.ceil(settings.validation_videos / int(config.data["batch_size"]))
-
-
-def _device(config: Config) -> torch.device:
-    """The device that `trainer.accelerator` asks for.
-
-    Raises:
-        UserError: a GPU is asked for and there is none.
-    """
-    wanted = config.trainer.accelerator
-    if wanted == "gpu" and not torch.cuda.is_available():
-        raise UserError("trainer.accelerator = gpu, but PyTorch finds no CUDA device: use trainer=cpu or trainer=auto.")
-    return torch.device("cuda" if wanted != "cpu" and torch.cuda.is_available() else "cpu")
 
 
 LONG = 3 * 3600.0

@@ -1,0 +1,113 @@
+"""Strict validation of plain values, and the wording of what is wrong: one sentence with key, value and what to do."""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from apex_lab.errors import UserError
+
+
+def one_line(error: BaseException | str) -> str:
+    """What an exception says, on one line and without a full stop."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text.rstrip(".")
+
+
+def sentence(text: str) -> str:
+    """The text on one line, ended by exactly one mark."""
+    text = one_line(text)
+    return text if text.endswith(("?", "!")) else text + "."
+
+
+def shown(value: object) -> str:
+    """A value as one would write it in a configuration."""
+    return json.dumps(value, ensure_ascii=False, default=str).replace('"', "'")
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """`"; did you mean 'x'?"`, or nothing where no known word is close."""
+    close = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"; did you mean '{close[0]}'?" if close else ""
+
+
+def validate(
+    schema: type[BaseModel],
+    values: Mapping[str, Any],
+    key: str,
+    names: Mapping[str, str] | None = None,
+    also_known: Iterable[str] = (),
+) -> BaseModel:
+    """Validates plain values against a pydantic model.
+
+    Validation goes through JSON, where a list stands for a tuple and a string for a path or an enumeration.
+
+    Args:
+        schema: what is wanted.
+        values: what came.
+        key: where the values stand in the configuration, for the message.
+        names: field of `schema` -> its key in the configuration, where they differ.
+        also_known: further words to suggest for an unknown key.
+
+    Raises:
+        UserError: the first fault in one sentence.
+    """
+    try:
+        return schema.model_validate_json(json.dumps(values))
+    except ValidationError as error:
+        raise UserError(_fault(error, values, key, names or {}, [*_fields(schema), *also_known])) from error
+
+
+def _fault(
+    error: ValidationError, values: Mapping[str, Any], key: str, names: Mapping[str, str], known: list[str]
+) -> str:
+    faults = error.errors(include_url=False)
+    first = faults[0]
+    place = _place(values, first["loc"])
+    if first["type"] == "missing":
+        place.append(first["loc"][-1])
+    words = [str(names.get(str(part), part)) for part in place]
+    full = ".".join([key, *words] if key else words)
+    if first["type"] == "extra_forbidden":
+        return sentence(f"Unknown key {full} = {shown(first['input'])}{did_you_mean('.'.join(words), known)}")
+    if first["type"] == "missing":
+        return sentence(f"{full} is missing: give it a value")
+    # a hint such as `float | Tensor` has a branch that no written value can take
+    told = [f["msg"] for f in faults if f["loc"][: len(place)] == tuple(place) and f["type"] != "needs_python_object"]
+    wanted = (
+        ", or ".join(dict.fromkeys(text[:1].lower() + text[1:] for text in told))
+        or "a component with a _target_ is wanted here"
+    )
+    wanted = wanted.removeprefix("value error, ")
+    if not place:
+        return sentence(f"{key}: {wanted}" if key else wanted)
+    return sentence(f"{full} = {shown(first['input'])} is wrong: {wanted}")
+
+
+def _place(values: object, location: tuple[int | str, ...]) -> list[int | str]:
+    """The keys in an error's location; pydantic also names the branch of a union there."""
+    place: list[int | str] = []
+    for part in location:
+        if isinstance(values, list):
+            inside = isinstance(part, int) and part < len(values)
+        else:
+            inside = isinstance(values, Mapping) and part in values
+        if inside:
+            place.append(part)
+            values = values[part]  # type: ignore[index]
+    return place
+
+
+def _fields(schema: type[BaseModel], prefix: str = "") -> list[str]:
+    """Dotted names of all fields of a model and of the models inside it."""
+    found = []
+    for name, field in schema.model_fields.items():
+        found.append(prefix + name)
+        if inspect.isclass(field.annotation) and issubclass(field.annotation, BaseModel):
+            found += _fields(field.annotation, f"{prefix}{name}.")
+    return found
