@@ -15,7 +15,16 @@ def metadata(frames: int) -> ObjectMetadata:
     visible[0, 3], amodal[:, 2] = 5, 0
     arm_contact, object_contact = np.zeros((frames, 3), dtype=bool), np.zeros((frames, 3, 3), dtype=bool)
     arm_contact[1, 2] = True
-    return p2d_metadata(["cup", None, "drill"], visible, amodal, arm_contact, object_contact)
+    return p2d_metadata(
+        {
+            "names": ["cup", "drill"],
+            "classes": np.array([4, -1, 2]),
+            "visible_px": visible,
+            "amodal_px": amodal,
+            "arm_contact": arm_contact,
+            "object_contact": object_contact,
+        }
+    )
 
 
 def test_p2d_metadata() -> None:

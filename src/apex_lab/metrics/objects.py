@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -34,27 +35,21 @@ class ObjectMetadata:
     contact: Bool[np.ndarray, "T L"] | None = None
 
 
-def p2d_metadata(
-    classes: Sequence[str | None],
-    visible_px: Integer[np.ndarray, "T O1"],
-    amodal_px: Integer[np.ndarray, "T O1"],
-    arm_contact: Bool[np.ndarray, "T O"],
-    object_contact: Bool[np.ndarray, "T O O"],
-) -> ObjectMetadata:
-    """From the arrays that P2D stores beside each video (the arm first in `visible_px` and `amodal_px`).
+def p2d_metadata(meta: Mapping[str, Any]) -> ObjectMetadata:
+    """From the labels that P2D keeps beside each video, as `P2D.meta` returns them.
 
     Args:
-        classes: class name per object slot, None for an unused one.
-        visible_px, amodal_px: visible pixels, and those without anything in front, of the arm and each slot.
-        arm_contact, object_contact: who touched whom since the frame before.
+        meta: `names`, class names of the used object slots; `classes` (O,), negative for an unused slot; `visible_px`
+            and `amodal_px` (T, O + 1), the arm first; `arm_contact` (T, O); `object_contact` (T, O, O).
     """
-    used = np.array([slot for slot, name in enumerate(classes) if name is not None], dtype=np.int64)
-    occlusion = 1 - visible_px / np.where(amodal_px > 0, amodal_px, np.nan)
-    contact = np.column_stack([arm_contact.any(axis=1), arm_contact | object_contact.any(axis=2)])
+    used = np.flatnonzero(meta["classes"] >= 0)
+    occlusion = 1 - meta["visible_px"] / np.where(meta["amodal_px"] > 0, meta["amodal_px"], np.nan)
+    of_objects = meta["arm_contact"] | meta["object_contact"].any(axis=2)
+    contact = np.column_stack([meta["arm_contact"].any(axis=1), of_objects])
     columns = np.append(0, used + 1)
     return ObjectMetadata(
         labels=np.append(P2D_ARM_LABEL, used + P2D_FIRST_OBJECT_LABEL),
-        classes=["arm", *(name for name in classes if name is not None)],
+        classes=["arm", *meta["names"]],
         occlusion=occlusion[:, columns],
         contact=contact[:, columns],
     )

@@ -1,0 +1,68 @@
+"""Predictions as files: formats that other people's tools read and write, and their scores.
+
+| format | what | written by | read |
+| --- | --- | --- | --- |
+| `npz` | soft masks and ids, `V__gt`, `V__masks`, `V__ids` per video V | `NpzWriter` | yes |
+| `coco` | COCO run-length masks in JSON, layout of Weis et al. | `CocoWriter` | yes |
+| `weis` | the same with the run strings that the public program reads | `CocoWriter(runs=True)` | as `coco` |
+| `davis` | palette PNGs | `DavisWriter` | yes |
+| `mots` | MOTS text, masks | `MotWriter(masks=True)` | yes |
+| `mot` | MOTChallenge text, boxes | `MotWriter` | no, boxes hold no masks |
+
+`score_predictions` scores what can be read; the result's keys are described in `apex_lab.metrics.KEYS` and in the
+result itself: `settings`, `versions`, `total` (the data set), `per_video`, `per_frame`, `per_object`, `hota_alpha`
+(HOTA per threshold) and `events` (CLEAR MOT events).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from apex_lab.errors import UserError
+from apex_lab.predictions.coco import CocoWriter
+from apex_lab.predictions.davis import DavisWriter
+from apex_lab.predictions.mot import MotWriter
+from apex_lab.predictions.npz import NpzWriter
+from apex_lab.predictions.score import score_predictions, write_result
+from apex_lab.predictions.truth import open_truth, p2d_video_name
+from apex_lab.predictions.video import PredictedVideo
+
+EXPORTS = ("npz", "coco", "weis", "davis", "mots", "mot")
+"""Formats that `open_writer` writes."""
+
+
+def open_writer(format: str, path: str | Path, truth: bool = False) -> NpzWriter | CocoWriter | DavisWriter | MotWriter:
+    """A writer of one format, to be used with `with` and fed with `add(PredictedVideo)`.
+
+    Args:
+        format: one of `EXPORTS`.
+        path: the file, or for davis, mots and mot the folder.
+        truth: write the ground truth in place of the predictions (npz files hold both anyway).
+
+    Raises:
+        UserError: no such format.
+    """
+    if format == "npz":
+        return NpzWriter(path)
+    if format in ("coco", "weis"):
+        return CocoWriter(path, runs=format == "weis", truth=truth)
+    if format == "davis":
+        return DavisWriter(path, truth=truth)
+    if format in ("mots", "mot"):
+        return MotWriter(path, masks=format == "mots", truth=truth)
+    raise UserError(f"there is no export format {format!r}; choose one of {', '.join(EXPORTS)}")
+
+
+__all__ = [
+    "EXPORTS",
+    "CocoWriter",
+    "DavisWriter",
+    "MotWriter",
+    "NpzWriter",
+    "PredictedVideo",
+    "open_truth",
+    "open_writer",
+    "p2d_video_name",
+    "score_predictions",
+    "write_result",
+]

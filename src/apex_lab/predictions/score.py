@@ -1,0 +1,223 @@
+"""Scores files of predictions, made by whatever program, with the code that scores the models of this repository."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Int64, Integer
+
+from apex_lab.errors import UserError
+from apex_lab.metrics import Evaluator, EvaluatorSettings
+from apex_lab.metrics.keys import keys
+from apex_lab.metrics.objects import ObjectMetadata
+from apex_lab.predictions.coco import read_coco
+from apex_lab.predictions.davis import read_davis, video_names
+from apex_lab.predictions.mot import read_mots
+from apex_lab.predictions.npz import NpzFile
+from apex_lab.predictions.truth import Truth, open_truth
+from apex_lab.predictions.video import fit
+
+FORMAT_VERSION = 1
+
+Format = Literal["npz", "coco", "davis", "mots"]
+"""What can be read. `coco` reads masks of both kinds that `coco.CocoWriter` writes."""
+
+Resize = Literal["masks", "truth"]
+
+
+@dataclass(frozen=True)
+class Scored:
+    """One video, ready to be scored."""
+
+    name: str
+    prediction: Int64[np.ndarray, "T H W"]
+    truth: Integer[np.ndarray, "T H W"]
+    metadata: ObjectMetadata | None
+
+
+def score_predictions(
+    path: str | Path,
+    *,
+    format: Format | None = None,
+    truth: str | Path | None = None,
+    split: str = "test",
+    partial: bool = False,
+    resize: Resize | None = None,
+    settings: EvaluatorSettings | None = None,
+    track: Callable[[list[str]], Iterable[str]] = iter,
+) -> dict[str, Any]:
+    """Every metric of a file (or folder) of predictions, per frame, per video and in total.
+
+    Args:
+        path: an npz file, a JSON file of run-length masks, a folder with a folder of PNGs per video, or a folder of
+            MOTS text files.
+        format: which of these; told by the name where missing.
+        truth: ground truth, see `truth.open_truth`; an npz file may hold its own.
+        split: of a P2D folder of ground truth.
+        partial: let ground truth have videos without a prediction.
+        resize: what to do with masks of another size than the ground truth: bring soft `masks` to its size
+            bilinearly, or the `truth` to theirs by nearest neighbour; None refuses them.
+        settings: how to score; rows per frame and events are kept where missing.
+        track: wraps the list of video names, for a progress bar.
+
+    Returns:
+        as `Evaluator.result`, with `source` (what was read and how) in front and `keys` (meaning, range and direction
+        of every number).
+
+    Raises:
+        UserError: files that are missing, damaged or malformed; names file, video, frame and value.
+    """
+    path = Path(path)
+    settings = settings or EvaluatorSettings(per_frame=True, events=True)
+    format = format or guess_format(path)
+    if format not in get_args(Format):
+        raise UserError(f"format is {format!r}; choose one of {', '.join(get_args(Format))}")
+    if resize not in (None, *get_args(Resize)):
+        raise UserError(f"resize is {resize!r}; choose one of {', '.join(get_args(Resize))}, or leave it out")
+    known = open_truth(truth, split) if truth is not None else None
+    evaluator = Evaluator(settings)
+    for video in _read(path, format, known, partial, resize, track):
+        try:
+            evaluator.add(video.name, video.prediction, video.truth, video.metadata)
+        except ValueError as error:
+            raise UserError(f"{path}: {error}") from error
+    source = {"predictions": str(path), "format": format, "truth": str(truth or path), "resize": resize}
+    documented = {name: asdict(key) for name, key in keys(settings.public_first_frame).items()}
+    return {"format_version": FORMAT_VERSION, "source": source, "keys": documented, **evaluator.result()}
+
+
+def guess_format(path: Path) -> Format:
+    """The format that a file's name or a folder's content speaks for.
+
+    Raises:
+        UserError: none.
+    """
+    if not path.exists():
+        raise UserError(f"there is no file or folder {path}")
+    if path.is_dir():
+        if video_names(path):
+            return "davis"
+        if any(path.glob("*.txt")):
+            return "mots"
+    elif path.suffix == ".json":
+        return "coco"
+    elif path.suffix == ".npz":
+        return "npz"
+    raise UserError(
+        f"{path} is neither .npz nor .json, nor a folder with a folder of PNGs per video or with MOTS .txt files; "
+        f"set format to one of {', '.join(get_args(Format))}"
+    )
+
+
+def write_result(result: dict[str, Any], path: str | Path) -> None:
+    """Writes a result as JSON, at once; tables as lists of rows, undefined values as null."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft.write_text(json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    os.replace(draft, path)
+
+
+def plain(value: Any) -> Any:
+    """What JSON can hold: NaN and infinities become None, tables lists of rows, NumPy numbers Python's."""
+    if isinstance(value, pd.DataFrame):
+        return plain(value.to_dict(orient="records"))
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _read(
+    path: Path,
+    format: Format,
+    truth: Truth | None,
+    partial: bool,
+    resize: Resize | None,
+    track: Callable[[list[str]], Iterable[str]],
+) -> Iterator[Scored]:
+    if format == "npz":
+        yield from _read_npz(path, truth, partial, resize, track)
+        return
+    if truth is None:
+        raise UserError(f"{path} holds no ground truth; name it with truth=FILE.npz or truth=FOLDER")
+    if resize == "masks":
+        raise UserError(f"resize=masks needs soft masks, and {path} holds none; resize=truth goes the other way")
+    if format == "coco":
+        yield from _read_ordered(path, truth, resize, track)
+        return
+    names = video_names(path) if format == "davis" else sorted(file.stem for file in path.glob("[!.]*.txt"))
+    for name in track(_common(path, names, truth.names, partial)):
+        labels = truth.labels(name)
+        found = read_davis(path, name) if format == "davis" else read_mots(path, name, _shape(labels))
+        where = f"{path}, video {name!r}"
+        yield Scored(name, found, fit(found, labels, resize, where), truth.metadata(name))
+
+
+def _read_ordered(
+    path: Path, truth: Truth, resize: Resize | None, track: Callable[[list[str]], Iterable[str]]
+) -> Iterator[Scored]:
+    """Videos without names, in the order of the ground truth."""
+    if resize is not None:
+        raise UserError(f"resize={resize} does not go with {path}: run-length masks must have the ground truth's size")
+    shapes = [_shape(truth.labels(name)) for name in truth.names]
+    for name, found in zip(track(truth.names), read_coco(path, shapes), strict=True):
+        yield Scored(name, found, truth.labels(name), truth.metadata(name))
+
+
+def _read_npz(
+    path: Path,
+    truth: Truth | None,
+    partial: bool,
+    resize: Resize | None,
+    track: Callable[[list[str]], Iterable[str]],
+) -> Iterator[Scored]:
+    file = NpzFile(path, need=("masks", "ids") if truth else ("gt", "masks", "ids"))
+    names = file.names if truth is None else _common(path, file.names, truth.names, partial)
+    if truth is None and resize is None:
+        for name in names:
+            if file.truth_size(name) != file.size(name):
+                (a, b), (c, d) = file.size(name), file.truth_size(name)
+                raise UserError(
+                    f"{file.where(name)}: the masks are {a} x {b}, the ground truth {c} x {d}; set resize to 'masks' "
+                    "or 'truth'"
+                )
+    for name in track(names):
+        labels = truth.labels(name) if truth else file.truth(name)
+        size = (labels.shape[1], labels.shape[2]) if resize == "masks" else None
+        found = file.identities(name, size)
+        yield Scored(name, found, fit(found, labels, resize, file.where(name)), truth.metadata(name) if truth else None)
+
+
+def _common(path: Path, predicted: list[str], true: list[str], partial: bool) -> list[str]:
+    """The videos to score; those that have a prediction must have ground truth, and the reverse unless `partial`."""
+    strange = [name for name in predicted if name not in set(true)]
+    if strange:
+        raise UserError(f"{path}: video {strange[0]!r} has no ground truth, which has {', '.join(true[:3])}, ...")
+    missing = [name for name in true if name not in set(predicted)]
+    if missing and not partial:
+        raise UserError(
+            f"{path}: {len(missing)} of the {len(true)} videos of the ground truth have no prediction, the first is "
+            f"{missing[0]!r}; set partial=true to score the others alone"
+        )
+    if not predicted:
+        raise UserError(f"{path} holds no prediction")
+    return predicted
+
+
+def _shape(labels: Integer[np.ndarray, "T H W"]) -> tuple[int, int, int]:
+    frames, height, width = labels.shape
+    return frames, height, width
