@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Integer
 from torch import Tensor, nn
 
 ABSENT = -1
@@ -87,7 +87,7 @@ class SceneModel(nn.Module):
         """RGB video in [0, 1] and the scheduled values at this step -> `Scene`."""
         raise TypeError(f"{type(self).__name__} does not define forward(video, schedule)")
 
-    def from_labels(self, video: Float[Tensor, "B T 3 H W"], segmentation: Int[Tensor, "B T H W"]) -> Scene:
+    def from_labels(self, video: Float[Tensor, "B T 3 H W"], segmentation: Integer[Tensor, "B T H W"]) -> Scene:
         """RGB video in [0, 1] and its ground truth -> `Scene`; called in place of `forward` where `needs_labels`."""
         raise TypeError(f"{type(self).__name__} does not read the ground truth: call forward(video, schedule)")
 

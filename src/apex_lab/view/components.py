@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ _HEADING = 44
 _CAPTION = 30
 _PLOT = 260
 _STAGES = ("first frame", "middle", "last frame")
+_COLUMNS = ("mask", "appearance", "window")
 _GROUP_GAP = 16
 
 
@@ -84,8 +86,9 @@ def component_panels(path: Path, item: Item, max_components: int = 10) -> None:
     """Draws what each component of a video is and does.
 
     A row shows, for the first, middle and last frame in which the identity is there: its soft mask, its own picture
-    (`Scene.means`; without one the input under its mask), and its window on the input. At the end: presence over
-    time (bars) and the share of pixels under its mask (line, relative to its largest).
+    (`Scene.means`; without them the input under its mask), and its window on the input (left out for models without
+    windows). At the end: presence over time (bars) and the share of pixels under its mask (line, relative to its
+    largest).
 
     Args:
         path: PNG to write.
@@ -96,11 +99,12 @@ def component_panels(path: Path, item: Item, max_components: int = 10) -> None:
         ValueError: the item's parts do not fit each other.
         UserError: the file cannot be written.
     """
-    clip = Clip(Item(*item))
+    clip = Clip(item)
     everyone = lives(clip.scene)
     shown = everyone[:max_components]
     height, width = cell_size(*clip.size, CELL)
-    group = 3 * (width + GAP) + _GROUP_GAP
+    columns = _COLUMNS if clip.scene.windows is not None else _COLUMNS[:-1]
+    group = len(columns) * (width + GAP) + _GROUP_GAP
     page, draw = sheet(
         2 * MARGIN + _LABELS + len(_STAGES) * group + _PLOT,
         2 * MARGIN + _CAPTION + _HEADING + max(1, len(shown)) * (height + 2 * GAP),
@@ -108,7 +112,7 @@ def component_panels(path: Path, item: Item, max_components: int = 10) -> None:
     rest = f", {len(everyone) - len(shown)} smaller ones not shown" if len(everyone) > len(shown) else ""
     caption = f"{clip.name}: {len(everyone)} component{'s' * (len(everyone) != 1)}{rest}"
     draw.text((MARGIN, MARGIN), fit(caption, page.width - 2 * MARGIN, font(17, bold=True)), INK, font(17, bold=True))
-    _headings(draw, width, group, appearance="under mask" if clip.scene.means is None else "appearance")
+    _headings(draw, width, group, columns, has_means=clip.scene.means is not None)
     for row, life in enumerate(shown):
         top = MARGIN + _CAPTION + _HEADING + row * (height + 2 * GAP)
         _label(draw, life, top + height // 2)
@@ -127,13 +131,14 @@ def _stages(life: Life) -> list[tuple[int, int]]:
     return [(stage, t) for t, stage in times.items()]
 
 
-def _headings(draw: ImageDraw.ImageDraw, width: int, group: int, appearance: str) -> None:
+def _headings(draw: ImageDraw.ImageDraw, width: int, group: int, columns: Sequence[str], has_means: bool) -> None:
     top = MARGIN + _CAPTION
     for stage, name in enumerate(_STAGES):
         left = MARGIN + _LABELS + stage * group
         draw.text((left + (group - _GROUP_GAP - GAP) // 2, top), name, INK, font(14, bold=True), anchor="mt")
-        for i, column in enumerate(("mask", appearance, "window")):
-            draw.text((left + i * (width + GAP) + width // 2, top + 36), column, FAINT, font(13), anchor="ms")
+        for i, column in enumerate(columns):
+            text = column if column != "appearance" or has_means else "under mask"
+            draw.text((left + i * (width + GAP) + width // 2, top + 36), text, FAINT, font(13), anchor="ms")
     left = MARGIN + _LABELS + len(_STAGES) * group
     draw.text((left + _PLOT // 2, top), "over time", INK, font(14, bold=True), anchor="mt")
     draw.text((left + _PLOT // 2, top + 36), "presence (bars), share of pixels (line)", FAINT, font(12), anchor="ms")
@@ -153,24 +158,27 @@ def _label(draw: ImageDraw.ImageDraw, life: Life, middle: int) -> None:
 
 
 def _panels(clip: Clip, life: Life, t: int, size: tuple[int, int]) -> list[Image.Image]:
-    """Mask, appearance and window of one component at frame t."""
+    """Mask, appearance and, if the model has them, window of one component at frame t."""
     scene, k = clip.scene, life.component[t]
     mask = scene.masks[0, t, k].numpy()[..., None]
     if scene.means is None:
         picture = enlarge(clip.frames[t], mask.shape[:2]) / 255 * mask
     else:
         picture = scene.means[0, t, k].permute(1, 2, 0).numpy()
-    window = None if scene.windows is None else scene.windows[0, t, k].numpy()
-    painted = [rgb8(mask * np.array(life.color) / 255), rgb8(picture), clip.frames[t]]
-    cells = [Image.fromarray(enlarge(picture, size)) for picture in painted]
-    cells[2] = _window(cells[2], window, color_of(life.identity))
-    ImageDraw.Draw(cells[0]).text((5, 4), f"t = {t}", (255, 255, 255), font(12), stroke_width=2, stroke_fill=(0, 0, 0))
+    painted = [rgb8(mask * np.array(life.color) / 255), rgb8(picture)]
+    cells = [Image.fromarray(enlarge(pixels, size)) for pixels in painted]
+    draw = ImageDraw.Draw(cells[0])
+    draw.rectangle(draw.textbbox((4, 4), f" t = {t} ", font(12)), fill=(0, 0, 0))
+    draw.text((4, 4), f" t = {t} ", (255, 255, 255), font(12))
+    if scene.windows is not None:
+        view = Image.fromarray(enlarge(clip.frames[t], size))
+        cells.append(_window(view, scene.windows[0, t, k].numpy(), color_of(life.identity)))
     return cells
 
 
-def _window(picture: Image.Image, window: Float[np.ndarray, "4"] | None, color: Color) -> Image.Image:
-    """Draws a window (s_y, s_x, t_y, t_x) on a picture; without one the picture is dimmed."""
-    if window is None or not np.isfinite(window).all():
+def _window(picture: Image.Image, window: Float[np.ndarray, "4"], color: Color) -> Image.Image:
+    """Draws a window (s_y, s_x, t_y, t_x) on a picture; where it is NaN the picture is dimmed."""
+    if not np.isfinite(window).all():
         dim: UInt8[np.ndarray, "h w 3"] = rgb8(0.35 * np.asarray(picture) / 255)
         page = Image.fromarray(dim)
         middle = (page.width // 2, page.height // 2)

@@ -104,7 +104,8 @@ def _panels(table: pd.DataFrame) -> dict[str, list[tuple[str, str, pd.Series]]]:
     numbers = Counter(_NUMBERED.sub(r"\g<panel>", name) for name in map(str, table) if _NUMBERED.match(name))
     for name in map(str, table):
         head, _, tail = name.partition("/")
-        split, quantity = (head, tail) if head in _GROUPS and tail else ("", name)
+        quantity = tail if head in _GROUPS and tail else name
+        split = head if head in SPLITS and tail else ""
         label, color = split, _SPLIT_COLORS.get(split, _SPLIT_COLORS["train"])
         match = _NUMBERED.match(quantity)
         if match and numbers[_NUMBERED.sub(r"\g<panel>", name)] > 1:
@@ -134,7 +135,7 @@ def _draw(ax: Axes, name: str, lines: Sequence[tuple[str, str, pd.Series]]) -> N
     low, high = np.quantile(everything, [0.05, 0.95])
     if everything.min() > 0 and high > 100 * low:
         ax.set_yscale("log")
-    ax.set_title(name.replace("_", " "), fontsize=10, fontweight="bold")
+    ax.set_title(name, fontsize=10, fontweight="bold")
     ax.tick_params(labelsize=8)
     ax.grid(visible=True, color="#e3e6ea", linewidth=0.6)
     ax.spines[["top", "right"]].set_visible(False)

@@ -34,7 +34,7 @@ def film_strip(path: Path, items: Sequence[Item], columns: int = 8) -> None:
     """
     if not items:
         raise ValueError("items is empty, expected at least one video")
-    save_png(path, _stack([_strip(Clip(Item(*item)), columns) for item in items]))
+    save_png(path, _stack([_strip(Clip(item), columns) for item in items]))
 
 
 def spread(frames: int, columns: int) -> list[int]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Integer, UInt8
 from torch import Tensor
 
 from apex_lab.scene import Scene
@@ -31,7 +31,7 @@ class Item(NamedTuple):
     video: UInt8[Tensor, "B T 3 H W"] | Float[Tensor, "B T 3 H W"]
     scene: Scene
     b: int
-    segmentation: Int[Tensor, "B T H W"] | UInt8[Tensor, "B T H W"] | None = None
+    segmentation: Integer[Tensor, "B T H W"] | None = None
 
 
 class Clip:
@@ -96,7 +96,7 @@ def one_video(scene: Scene, b: int) -> Scene:
     """The scene of video `b` alone (B = 1), on the CPU, in float32, without loss terms."""
 
     def cut(tensor: Tensor) -> Tensor:
-        tensor = tensor[b : b + 1].detach().cpu()
+        tensor = tensor[b : b + 1].detach().cpu().clone()  # a view would keep the whole batch alive
         return tensor.float() if tensor.is_floating_point() else tensor
 
     return dataclasses.replace(

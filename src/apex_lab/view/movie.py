@@ -41,7 +41,7 @@ def movie(path: Path, items: Sequence[Item], fps: float = 5.0) -> None:
     """
     if not items:
         raise ValueError("items is empty, expected at least one video")
-    clips = [Clip(Item(*item)) for item in items]
+    clips = [Clip(item) for item in items]
     if len({clip.rows for clip in clips}) > 1:
         raise ValueError("items are partly with and partly without segmentation, expected all or none")
     if path.suffix == ".mp4":
@@ -89,6 +89,7 @@ def _frames(clips: Sequence[Clip]) -> Iterator[Image.Image]:
 
 def _write_mp4(path: Path, clips: Sequence[Clip], fps: float) -> None:
     """ffmpeg needs a file name to write to; what it made is moved into place only if it is whole."""
+    _need_ffmpeg(path)
     try:
         with tempfile.TemporaryDirectory() as folder:
             part = Path(folder) / path.name
@@ -112,31 +113,47 @@ def _encode(path: Path, clips: Sequence[Clip], fps: float) -> None:
         if encoder is not None:
             encoder.close()
     # ffmpeg may fail at its last write, when nobody listens any more
-    written = imageio_ffmpeg.count_frames_and_secs(str(path))[0] if path.exists() else 0
-    if written != count:
+    if (written := _count(path)) != count:
         raise OSError(f"ffmpeg wrote {written} of {count} frames")
+
+
+def _count(path: Path) -> int:
+    """Frames of a movie; 0 if it cannot be read."""
+    if not path.exists():
+        return 0
+    try:
+        return imageio_ffmpeg.count_frames_and_secs(str(path))[0]
+    except RuntimeError:  # what imageio_ffmpeg raises for a file that ffmpeg cannot open
+        return 0
+
+
+def _need_ffmpeg(path: Path) -> None:
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError:
+        program = "ffmpeg"
+    if shutil.which(program) is None:
+        raise UserError(
+            f"{path.name} cannot be made, {program} is no program: "
+            "install ffmpeg and set the variable IMAGEIO_FFMPEG_EXE to where it is"
+        )
 
 
 def _encoder(path: Path, size: tuple[int, int], fps: float):  # type: ignore[no-untyped-def]  # imageio_ffmpeg has no types
     """A started ffmpeg that takes RGB frames."""
-    try:
-        encoder = imageio_ffmpeg.write_frames(
-            str(path),
-            size,
-            fps=fps,
-            codec="libx264",
-            pix_fmt_out="yuv420p",
-            quality=None,
-            macro_block_size=2,
-            ffmpeg_log_level="error",
-            # near-lossless, so that thin outlines survive; the index in front, so that browsers start at once
-            output_params=["-crf", "16", "-preset", "slow", "-movflags", "+faststart", "-threads", "1"],
-        )
-        encoder.send(None)
-    except RuntimeError as error:
-        raise UserError(
-            f"{path.name} cannot be made without ffmpeg: install it and set the variable IMAGEIO_FFMPEG_EXE to its path"
-        ) from error
+    encoder = imageio_ffmpeg.write_frames(
+        str(path),
+        size,
+        fps=fps,
+        codec="libx264",
+        pix_fmt_out="yuv420p",
+        quality=None,
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+        # near-lossless, so that thin outlines survive; the index in front, so that browsers start at once
+        output_params=["-crf", "16", "-preset", "slow", "-movflags", "+faststart", "-threads", "1"],
+    )
+    encoder.send(None)
     return encoder
 
 

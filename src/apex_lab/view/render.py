@@ -32,7 +32,6 @@ def render_all(
         ValueError: items that do not fit each other, or share a name.
         UserError: a file cannot be written, or the table of curves cannot be read.
     """
-    items = [Item(*item) for item in items]
     panels = [folder / f"components_{_slug(item.name)}.png" for item in items]
     if len(set(panels)) < len(panels):
         raise ValueError(f"items have names {[item.name for item in items]}, expected all different")

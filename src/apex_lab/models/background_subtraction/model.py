@@ -19,7 +19,8 @@ class BackgroundSubtraction(SceneModel):
     """Whatever differs from the median picture is an object. For a camera that stands still.
 
     1. A pixel is foreground where the RGB distance to the median picture exceeds `threshold`.
-    2. The foreground is cleaned by an opening and a closing with a disc of `radius` pixels.
+    2. The foreground is cleaned by an opening with a disc of `radius` pixels. There is no closing: it would fill the
+       gap between the arm and what it pushes.
     3. Its connected regions (8 neighbours) of at least `min_area` are the objects, the `max_objects` largest of them.
     4. Regions of consecutive frames are linked (`apex_lab.models.linking.link`).
 
@@ -29,7 +30,7 @@ class BackgroundSubtraction(SceneModel):
     Args:
         image_size: side of the (square) images, in pixels.
         threshold: Euclidean distance in RGB, each channel in [0, 1].
-        radius: of the disc of opening and closing, in pixels; 0 for none.
+        radius: of the disc, in pixels; 0 for no opening.
         min_area: smallest object as a share of the image.
         max_objects: components beside the background, K = max_objects + 1.
     """
@@ -94,7 +95,6 @@ class BackgroundSubtraction(SceneModel):
         if self.radius > 0:
             disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * self.radius + 1, 2 * self.radius + 1))
             foreground = cv2.morphologyEx(foreground, cv2.MORPH_OPEN, disc)
-            foreground = cv2.morphologyEx(foreground, cv2.MORPH_CLOSE, disc)
         _, numbers, stats, _ = cv2.connectedComponentsWithStats(foreground, connectivity=8)
         areas = stats[:, cv2.CC_STAT_AREA].copy()
         areas[0] = 0  # number 0 is what is not foreground

@@ -61,7 +61,7 @@ class ColorClusters(SceneModel):
 
     def __init__(
         self,
-        colors: Annotated[int, Field(ge=2, le=64)] = 8,
+        colors: Annotated[int, Field(ge=2, le=64)] = 4,
         min_area: Annotated[float, Field(ge=0, lt=1)] = 0.005,
         max_objects: Annotated[int, Field(ge=1, le=63)] = 10,
         seed: Annotated[int, Field(ge=0)] = 0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Integer
 from pydantic import Field
 from torch import Tensor
 
@@ -40,7 +40,7 @@ class Oracle(SceneModel):
         """
         raise TypeError("Oracle reads the ground truth: call from_labels(video, segmentation) in place of forward")
 
-    def from_labels(self, video: Float[Tensor, "B T 3 H W"], segmentation: Int[Tensor, "B T H W"]) -> Scene:
+    def from_labels(self, video: Float[Tensor, "B T 3 H W"], segmentation: Integer[Tensor, "B T H W"]) -> Scene:
         """RGB video in [0, 1] and its labels -> the perfect scene.
 
         An object has an identity in the frames in which it has a pixel.
