@@ -29,7 +29,7 @@ def settings_from(words: list[str], base: Settings | None = None) -> Settings:
         if not equals:
             raise SettingsError(f"--set {word}: expected key=value, for example --set frames=20")
         try:
-            value = json.loads(text)
+            value = json.loads(text, parse_constant=_no_number)
         except ValueError:
             value = text
         *parents, name = key.split(".")
@@ -43,6 +43,10 @@ def settings_from(words: list[str], base: Settings | None = None) -> Settings:
         return Settings.model_validate_json(json.dumps(data))
     except ValidationError as error:
         raise SettingsError(sentence(error)) from None
+
+
+def _no_number(word: str) -> None:
+    raise ValueError(word)  # NaN and Infinity stay text, which no setting takes
 
 
 def sentence(error: ValidationError) -> str:

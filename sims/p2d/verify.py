@@ -6,6 +6,7 @@ import json
 import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -168,7 +169,7 @@ def _state(root: Path, manifest: Manifest) -> dict[str, Any]:
 
 
 def _note(path: Path, state: dict[str, Any]) -> None:
-    if os.access(path.parent, os.W_OK):  # a folder that cannot be written is checked again every time
+    with suppress(OSError):  # where nothing can be written, the data are checked again every time
         write_at_once(path, json.dumps(state, indent=1) + "\n")
 
 

@@ -12,6 +12,7 @@ for batch in DataLoader(P2D("data/p2d", "train"), batch_size=4, shuffle=True):
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -106,16 +107,15 @@ class P2D(Dataset[dict[str, Any]]):
             raise UserError(f"split {self.split} of {self.root} is empty, so it has no median picture")
         count = len(frames) if sample is None else min(sample, len(frames))
         cache = self.root / f".median_{self.split}_{count}_{self.manifest.content[:8]}.npy"
-        if not cache.exists():
-            chosen = (np.arange(count) * len(frames)) // count
-            median = _median(frames, chosen)
-            if not os.access(self.root, os.W_OK):
-                return torch.from_numpy(median)
-            draft = cache.with_name(f"{cache.name}.{os.getpid()}")
+        if cache.exists():
+            return torch.from_numpy(np.load(cache))
+        median = _median(frames, (np.arange(count) * len(frames)) // count)
+        draft = cache.with_name(f"{cache.name}.{os.getpid()}")
+        with suppress(OSError):  # where nothing can be written, it is computed every time
             with open(draft, "wb") as file:
                 np.save(file, median)
             os.replace(draft, cache)
-        return torch.from_numpy(np.load(cache))
+        return torch.from_numpy(median)
 
     def _position(self, index: int) -> int:
         if not -len(self) <= index < len(self):

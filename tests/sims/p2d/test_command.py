@@ -39,6 +39,7 @@ def test_settings_from_words():
         ("frames=0", "setting frames=0 is not possible: input should be greater than or equal to 1"),
         ("frames=2.5", "setting frames=2.5 is not possible: input should be a valid integer"),
         ("frames=true", "setting frames=True is not possible: input should be a valid integer"),
+        ("aim=NaN", "setting aim='NaN' is not possible: input should be a valid number"),
         ("renderer=blender", "setting renderer='blender' is not possible: input should be 'tiny' or 'egl'"),
         ("min_objects=4", "settings do not fit together: min_objects 4 must not exceed max_objects 3"),
         ("camera.fog=1", "unknown setting 'camera.fog'"),
