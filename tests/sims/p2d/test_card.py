@@ -74,9 +74,10 @@ def test_occlusion_area_and_cut(root: Path, stats: Stats):
             assert stats.occlusion[n, t, part] == pytest.approx(1 - mask.sum() / amodal[n, t, part])
 
 
-def test_page_has_every_part_and_no_hole(root: Path, tmp_path: Path):
-    page = write_card(root, tmp_path)
-    text = page.read_text()
+def test_page_has_every_part_and_no_hole(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["card", str(root), "--out", str(tmp_path)]) == 0
+    assert capsys.readouterr().out == f"data card: {tmp_path / 'README.md'}\n"
+    text = (tmp_path / "README.md").read_text()
     assert "nan%" not in text
     for name in re.findall(r"\]\(([^)]+)\)", text):
         with Image.open(tmp_path / name) as picture:
@@ -96,11 +97,6 @@ def test_page_of_nothing_is_refused(tmp_path: Path):
     make(tmp_path, small(train=0, val=0, test=0))
     with pytest.raises(SimError, match="holds no trajectory"):
         write_card(tmp_path, tmp_path / "card")
-
-
-def test_the_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["card", str(root), "--out", str(tmp_path)]) == 0
-    assert capsys.readouterr().out == f"data card: {tmp_path / 'README.md'}\n"
 
 
 def test_overlay_outlines_every_mask_in_its_colour():

@@ -99,7 +99,7 @@ def test_exit_codes_and_no_traceback(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_progress_without_a_terminal_is_plain_lines(tmp_path: Path):
     process = start("--out", tmp_path, *words(small()), "--workers", 1, "--no-card")
-    _, text = process.communicate(timeout=60)
+    _, text = process.communicate(timeout=120)
     assert process.returncode == 0
     lines = text.splitlines()
     assert lines[0] == f"P2D {tmp_path.name}: 36 frames"
@@ -107,13 +107,21 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path: Path):
     assert "\x1b" not in text
 
 
-def test_the_real_simulator_gives_the_same_bytes_with_any_number_of_workers(tmp_path: Path):
+@pytest.mark.parametrize(
+    ("settings", "workers"),
+    [
+        (Settings(train=2, val=1, test=0, frames=2, image_size=32), 2),
+        pytest.param(Settings(train=20, val=3, test=3, frames=6, image_size=64, seed=5), 5, marks=pytest.mark.slow),
+    ],
+)
+def test_the_real_simulator_gives_the_same_bytes_with_any_number_of_workers(
+    tmp_path: Path, settings: Settings, workers: int
+):
     pytest.importorskip("pybullet")
     from sims.p2d.generate import generate
 
-    settings = Settings(train=2, val=1, test=0, frames=2, image_size=32)
     one = generate(tmp_path / "one", settings, workers=1, shown=False)
-    generate(tmp_path / "two", settings, workers=2, shown=False)
+    generate(tmp_path / "two", settings, workers=workers, shown=False, recycle=4)
     assert content(tmp_path / "one") == content(tmp_path / "two")
     assert read_manifest(tmp_path / "one") == one
     assert "pybullet" in one.facts["versions"]

@@ -31,9 +31,11 @@ def unbroken(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return content(root)
 
 
-@pytest.mark.parametrize("workers", [2, 5])
+@pytest.mark.parametrize(
+    "workers", [3, pytest.param(2, marks=pytest.mark.slow), pytest.param(9, marks=pytest.mark.slow)]
+)
 def test_same_bytes_by_any_number_of_workers(tmp_path: Path, unbroken: dict[str, bytes], workers: int):
-    make(tmp_path, workers=workers, recycle=4)
+    make(tmp_path, workers=workers)
     assert content(tmp_path) == unbroken
 
 
@@ -48,7 +50,7 @@ def test_workers_are_replaced_after_some_trajectories(tmp_path: Path, monkeypatc
 
 @linux
 @pytest.mark.parametrize(
-    "rounds", [pytest.param(4), pytest.param(40, marks=[pytest.mark.slow, pytest.mark.timeout(600)])]
+    "rounds", [pytest.param(3), pytest.param(40, marks=[pytest.mark.slow, pytest.mark.timeout(600)])]
 )
 def test_same_bytes_after_kills_at_random_moments(tmp_path: Path, rounds: int):
     rng = random.Random(rounds)
@@ -74,15 +76,13 @@ def test_same_bytes_after_kills_at_random_moments(tmp_path: Path, rounds: int):
 @linux
 def test_same_bytes_when_only_workers_are_killed(tmp_path: Path, unbroken: dict[str, bytes]):
     rng = random.Random(1)
-    process = start("--out", tmp_path, *words(small()), "--workers", 2, "--no-card", FAKE_SLEEP_S=0.15)
-    kills = 0
-    while process.poll() is None:
-        time.sleep(rng.uniform(0.3, 0.6))
-        if kills < 4 and (workers := children(process.pid)):
-            os.kill(rng.choice(workers), signal.SIGKILL)
-            kills += 1
-    assert process.returncode == 0, process.stderr.read()
-    assert kills
+    process = start("--out", tmp_path, *words(small()), "--workers", 2, "--no-card", FAKE_SLEEP_S=0.3)
+    for lines in (2, 5, 8):  # between kills a trajectory was finished, so no one is killed over and over
+        _wait_for_lines(tmp_path / JOURNAL, lines, process)
+        time.sleep(rng.uniform(0, 0.2))
+        os.kill(rng.choice(children(process.pid)), signal.SIGKILL)
+    _, text = process.communicate(timeout=120)
+    assert process.returncode == 0, text
     assert content(tmp_path) == unbroken
 
 
@@ -208,7 +208,7 @@ def test_two_at_once_make_every_trajectory_once(tmp_path: Path, unbroken: dict[s
         start("--out", tmp_path / "data", *words(small()), "--workers", 1, "--no-card", FAKE_LOG=log, FAKE_SLEEP_S=0.1)
         for _ in range(2)
     ]
-    texts = [process.communicate(timeout=60)[1] for process in both]
+    texts = [process.communicate(timeout=120)[1] for process in both]
     assert [process.returncode for process in both] == [0, 0], texts
     assert sum("waiting for another process that works on" in text for text in texts) == 1
     assert len(list(log.iterdir())) == 12
@@ -222,14 +222,14 @@ def test_ctrl_c_ends_cleanly_and_the_same_command_goes_on(tmp_path: Path, unbrok
     _wait_for_lines(tmp_path / JOURNAL, 3, process)
     workers = children(process.pid)
     os.killpg(process.pid, signal.SIGINT)
-    _, text = process.communicate(timeout=30)
+    _, text = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "Traceback" not in text
     assert "the same command goes on" in text
     assert workers
     _wait_until_gone(workers)
     again = start(*command)
-    assert again.wait(timeout=60) == 0
+    assert again.wait(timeout=120) == 0
     assert content(tmp_path) == unbroken
 
 
@@ -331,7 +331,7 @@ def _wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> N
 
 
 def _wait_until_gone(pids: list[int]) -> None:
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while any(_alive(pid) for pid in pids):
         assert time.monotonic() < deadline, f"a process of {pids} lives on"
         time.sleep(0.02)

@@ -207,12 +207,17 @@ def test_a_repair_never_writes_other_bytes(root: Path, monkeypatch: pytest.Monke
 def test_a_killed_repair_can_be_started_again(root: Path, made: Path):
     for index in range(8):
         flip(root / "train" / "rgb.npy", 128 + index * 3 * 16 * 16 * 3)
-    process = start("verify", root, "--repair", "--workers", 1, FAKE_SLEEP_S=0.1)
-    time.sleep(1.5)
+    log = root.parent / "log"
+    log.mkdir()
+    process = start("verify", root, "--repair", "--workers", 1, FAKE_LOG=log, FAKE_SLEEP_S=0.2)
+    while len(list(log.iterdir())) < 3:
+        assert process.poll() is None
+        time.sleep(0.02)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
+    assert 0 < len(verify(root, read_manifest(root), shown=False).trajectories) < 8
     again = start("verify", root, "--repair", "--workers", 1)
-    text, _ = again.communicate(timeout=60)
+    text, _ = again.communicate(timeout=120)
     assert again.returncode == 0
     assert f"{root}: mended" in text
     assert content(root) == content(made)
