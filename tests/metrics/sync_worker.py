@@ -60,14 +60,14 @@ def run(batches: list[list[int]]) -> dict[str, object]:
     return results(metrics)
 
 
-def main() -> None:
-    rank, world, folder = int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])
-    if world > 1:
-        dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=world)
-    (folder / f"{rank}.json").write_text(json.dumps(run(json.loads(sys.argv[4]))))
-    if world > 1:
+def main(arguments: list[str]) -> None:
+    rank, world, folder = int(arguments[0]), int(arguments[1]), Path(arguments[2])
+    dist.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=world)
+    try:
+        (folder / f"{rank}.json").write_text(json.dumps(run(json.loads(arguments[3]))))
+    finally:
         dist.destroy_process_group()
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])

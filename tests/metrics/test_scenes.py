@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from apex_lab.metrics import scene_identities
+from apex_lab.metrics import background_identities, scene_identities
 from apex_lab.metrics.scenes import resize_masks
 from apex_lab.scene import ABSENT, Scene
 
@@ -36,6 +36,16 @@ def test_identity_of_the_winner() -> None:
 def test_absent_objects_leave_their_pixels_to_the_next_best() -> None:
     found = scene_identities(scene(three_masks(), [5, 8, 0], [0.4, 1.0, 0.0], [False, False, True]))
     assert found.tolist() == [[[[0, 8, 8, 0]]]]
+
+
+def test_absent_objects_leave_nothing_where_presence_comes_after() -> None:
+    absent = scene(three_masks(), [5, 8, 0], [0.4, 1.0, 0.0], [False, False, True])
+    assert scene_identities(absent, presence_after=True).tolist() == [[[[9, 9, 8, 0]]]]
+
+
+def test_background_identities() -> None:
+    found = scene(three_masks(), [5, ABSENT, 0], [1.0, 1.0, 1.0], [False, True, True])
+    assert background_identities(found) == [{0}]
 
 
 def test_a_pixel_without_identity_is_refused() -> None:

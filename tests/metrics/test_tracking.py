@@ -269,7 +269,7 @@ def test_contradicting_counts_are_a_fault_of_ours() -> None:
         ({"first_frame": -1}, "first_frame is -1"),
         ({"first_frame": 3, "stop_frame": 3}, "stop_frame 3"),
         ({"min_iou": 0.0}, "min_iou is 0.0"),
-        ({"tracked_share": 80}, "tracked_share is 80"),
+        ({"tracked_share": 80.0}, "tracked_share is 80"),
         ({"background_iou": 1.5}, "background_iou is 1.5"),
         ({"min_pixels": -1}, "min_pixels is -1"),
     ],

@@ -77,8 +77,9 @@ def compact(labels: Int64[Tensor, "S N"], keep_zero: bool = False) -> tuple[Int6
         the renamed labels, and the old label of each new one (L is the largest number of labels in a set, `PAD`
         fills the rest).
     """
-    if int(labels.max()) < _MAX_SPAN:
-        names = torch.arange(int(labels.max()) + 1, device=labels.device)
+    largest = int(labels.max())
+    if largest < _MAX_SPAN:
+        names = torch.arange(largest + 1, device=labels.device)
     else:
         names = torch.cat([labels.new_zeros(1), labels.flatten()]).unique()
         labels = torch.searchsorted(names, labels)
@@ -106,12 +107,14 @@ def check_labels(prediction: Tensor, truth: Tensor) -> None:
         )
     if truth.numel() == 0:
         raise ValueError(f"label maps of shape {tuple(truth.shape)} hold no pixel")
-    if int(truth.min()) < 0:
+    smallest = int(truth.min())
+    if smallest < 0:
         raise ValueError(
-            f"truth has the negative label {int(truth.min())}; 'ignore' labels are not supported, 0 is the background"
+            f"truth has the negative label {smallest}; 'ignore' labels are not supported, 0 is the background"
         )
-    if int(prediction.min()) < 0:
+    smallest = int(prediction.min())
+    if smallest < 0:
         raise ValueError(
-            f"prediction has a pixel with the identity {int(prediction.min())}; every pixel must go to a segment with "
-            "an identity >= 0 (an absent slot must have a zero mask, the background an identity of its own)"
+            f"prediction has a pixel with the identity {smallest}; every pixel must go to a segment with an identity "
+            ">= 0 (an absent slot must have a zero mask, the background an identity of its own)"
         )

@@ -15,7 +15,7 @@ from jaxtyping import Float64, Integer
 
 from apex_lab.metrics.hota import ALPHAS, HotaCounts
 from apex_lab.metrics.identity import IdentityCounts
-from apex_lab.metrics.keys import FRAME_SCORES, VIDEO_SCORES, keys
+from apex_lab.metrics.keys import FRAME_SCORES, VIDEO_SCORES, Number, keys
 from apex_lab.metrics.linking import link_frames
 from apex_lab.metrics.objects import COLUMNS, ObjectMetadata
 from apex_lab.metrics.record import EvaluatorSettings, VideoRecord, score_video, tracking_values
@@ -119,10 +119,10 @@ class Evaluator:
             }
         return found
 
-    def _row(self, records: Sequence[VideoRecord]) -> dict[str, float]:
+    def _row(self, records: Sequence[VideoRecord]) -> dict[str, Number]:
         """The values of some videos together."""
         tracks = [record.tracks for record in records if record.tracks]
-        row: dict[str, float] = {
+        row: dict[str, Number] = {
             "frames": sum(record.frames for record in records),
             "empty_frames": sum(record.empty_frames for record in records),
         }

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Level = Literal["frame", "video", "total"]
+Number = int | float
 _ALL: tuple[Level, ...] = ("frame", "video", "total")
 _LONG: tuple[Level, ...] = ("video", "total")
 

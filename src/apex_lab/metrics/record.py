@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from apex_lab.metrics.boundary import TOLERANCE, BoundaryScores, boundary_scores
 from apex_lab.metrics.contingency import Contingency, contingency
 from apex_lab.metrics.hota import HotaCounts
 from apex_lab.metrics.identity import IdentityCounts
-from apex_lab.metrics.keys import KEYS
+from apex_lab.metrics.keys import KEYS, Number
 from apex_lab.metrics.objects import ObjectMetadata, object_rows
 from apex_lab.metrics.overlap import mean_best_overlap, mean_matched_iou
 from apex_lab.metrics.segmentation import SCORES, video_scores
@@ -105,7 +106,7 @@ class VideoRecord:
     scores: dict[str, tuple[float, int]]
     tracks: TrackRecord | None
     objects: pd.DataFrame
-    rows: list[dict[str, float]]
+    rows: list[dict[str, Number]]
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,8 @@ def score_video(
 ) -> VideoRecord:
     """Scores one video; arguments as in `Evaluator.add`, identities as they are."""
     prediction, truth = (np.ascontiguousarray(labels).astype(np.int64) for labels in (prediction, truth))
-    batch = contingency(torch.from_numpy(prediction)[None], torch.from_numpy(truth)[None])
+    with _one_thread():
+        batch = contingency(torch.from_numpy(prediction)[None], torch.from_numpy(truth)[None])
     table = _Table(batch, batch.counts[0].numpy(), batch.labels[0].numpy(), batch.ids[0].numpy())
     columns = _frame_scores(table, settings.skip_empty)
     scores = {name: _sum_and_count(values) for name, values in columns.items()}
@@ -156,7 +158,7 @@ def score_video(
     )
 
 
-def tracking_values(clear: TrackingCounts, identity: IdentityCounts, suffix: str = "") -> dict[str, float]:
+def tracking_values(clear: TrackingCounts, identity: IdentityCounts, suffix: str = "") -> dict[str, Number]:
     """Rates, IDF1 and counts under the keys of an evaluation."""
     values = clear.rates() | {"idf1": identity.idf1()} | asdict(clear)
     return {name + suffix: value for name, value in values.items()}
@@ -224,12 +226,24 @@ def _tracking_columns(
     return columns
 
 
-def _rows(columns: dict[str, Float64[np.ndarray, "T"]], n_frames: int) -> list[dict[str, float]]:
+def _rows(columns: dict[str, Float64[np.ndarray, "T"]], n_frames: int) -> list[dict[str, Number]]:
+    def value(name: str, frame: int) -> Number:
+        number = float(columns[name][frame]) if name in columns else math.nan
+        return int(number) if name.startswith("num_") and not math.isnan(number) else number
+
     names = [name for name, key in KEYS.items() if "frame" in key.levels]
-    return [
-        {"frame": t} | {name: float(columns[name][t]) if name in columns else math.nan for name in names}
-        for t in range(n_frames)
-    ]
+    return [{"frame": t} | {name: value(name, t) for name in names} for t in range(n_frames)]
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One video is a millisecond's work: threads gain nothing, and wait for each other where cores are shared."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _sum_and_count(values: Float64[np.ndarray, "T"]) -> tuple[float, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -12,7 +13,7 @@ from apex_lab.scene import ABSENT, Scene
 
 
 def scene_identities(
-    scene: Scene, size: tuple[int, int] | None = None, min_presence: float = 0.5
+    scene: Scene, size: tuple[int, int] | None = None, min_presence: float = 0.5, presence_after: bool = False
 ) -> Int[Tensor, "B T H W"]:
     """Identity of the winning component at every pixel, in the resolution of the ground truth.
 
@@ -20,7 +21,9 @@ def scene_identities(
         scene: what a model says.
         size: (H, W) of the ground truth; soft masks of another size are resized before the argmax
             (metrics.md section 0). None keeps the masks' own size.
-        min_presence: objects below it are taken out before the argmax (metrics.md section 2.4).
+        min_presence: objects below it are absent (metrics.md section 2.4).
+        presence_after: absent objects are taken out after the argmax and not before it: their pixels do not go to the
+            next best component but to one segment of nothing, with an identity above all others.
 
     Raises:
         ValueError: a pixel was won by a component without an identity.
@@ -40,7 +43,17 @@ def scene_identities(
             f"{float(nameless.double().mean()):.2%} of the pixels were won by a component without an identity "
             f"(id {ABSENT}): a model must give an absent component a zero mask, and a background component an id"
         )
-    return scene.segmentation(min_presence)
+    if not presence_after:
+        return scene.segmentation(min_presence)
+    found = scene.segmentation(min_presence=0.0)
+    absent = (scene.presence < min_presence) & ~scene.background
+    nothing = absent.gather(2, winner.flatten(2)).view_as(found)
+    return torch.where(nothing, found.max() + 1, found)
+
+
+def background_identities(scene: Scene) -> list[set[int]]:
+    """Identities of the background components of each video of the batch (for `drop_background_slot`)."""
+    return [set(ids[:, scene.background].flatten().tolist()) - {ABSENT} for ids in scene.ids]
 
 
 def resize_masks(masks: Float[Tensor, "B T K H W"], size: tuple[int, int]) -> Float[Tensor, "B T K H2 W2"]:

@@ -18,6 +18,7 @@ Frames without any object (both foreground metrics): ARI-FG 1 and covering 0 as 
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Literal, get_args
 
 import torch
@@ -145,8 +146,8 @@ def best_overlap(
     if not background:
         weight = torch.cat([torch.zeros_like(weight[..., :1]), weight[..., 1:]], dim=-1)
     best = intersection_over_union(counts).amax(dim=-1)
-    # A running sum adds from left to right, so rows that only pad a batch cannot change the last digit.
-    total = (best * weight).cumsum(dim=-1)[..., -1]
+    # Added from left to right, so rows that only pad a batch cannot change the last digit.
+    total = reduce(torch.add, (best * weight).unbind(dim=-1))
     return total / weight.sum(dim=-1).clamp(min=1)
 
 

@@ -234,5 +234,5 @@ class TrackingCounts:
         return rates
 
 
-def _percent(part: float, whole: int) -> float:
+def _percent(part: int | float, whole: int) -> float:
     return 100 * part / whole if whole else math.nan

@@ -46,11 +46,11 @@ class Scored:
 def score_predictions(
     path: str | Path,
     *,
-    format: Format | None = None,
+    format: str | None = None,
     truth: str | Path | None = None,
     split: str = "test",
     partial: bool = False,
-    resize: Resize | None = None,
+    resize: str | None = None,
     settings: EvaluatorSettings | None = None,
     track: Callable[[list[str]], Iterable[str]] = iter,
 ) -> dict[str, Any]:
@@ -143,10 +143,10 @@ def plain(value: Any) -> Any:
 
 def _read(
     path: Path,
-    format: Format,
+    format: str,
     truth: Truth | None,
     partial: bool,
-    resize: Resize | None,
+    resize: str | None,
     track: Callable[[list[str]], Iterable[str]],
 ) -> Iterator[Scored]:
     if format == "npz":
@@ -168,7 +168,7 @@ def _read(
 
 
 def _read_ordered(
-    path: Path, truth: Truth, resize: Resize | None, track: Callable[[list[str]], Iterable[str]]
+    path: Path, truth: Truth, resize: str | None, track: Callable[[list[str]], Iterable[str]]
 ) -> Iterator[Scored]:
     """Videos without names, in the order of the ground truth."""
     if resize is not None:
@@ -182,7 +182,7 @@ def _read_npz(
     path: Path,
     truth: Truth | None,
     partial: bool,
-    resize: Resize | None,
+    resize: str | None,
     track: Callable[[list[str]], Iterable[str]],
 ) -> Iterator[Scored]:
     file = NpzFile(path, need=("masks", "ids") if truth else ("gt", "masks", "ids"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Integer
@@ -15,6 +15,7 @@ from apex_lab.predictions.davis import read_davis, video_names
 from apex_lab.predictions.npz import NpzFile
 
 
+@runtime_checkable
 class Truth(Protocol):
     """Ground truth of some videos, read one at a time."""
 

@@ -95,7 +95,7 @@ def check_labels(truth: Integer[np.ndarray, "T H W"], where: str) -> None:
 
 
 def fit(
-    prediction: Int64[np.ndarray, "T H W"], truth: Integer[np.ndarray, "T H2 W2"], resize: str | None, where: str
+    prediction: Int64[np.ndarray, "T H W"], truth: Integer[np.ndarray, "T2 H2 W2"], resize: str | None, where: str
 ) -> Integer[np.ndarray, "T H W"]:
     """The ground truth in the size of the prediction.
 
