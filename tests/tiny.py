@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import time
 from collections.abc import Iterator
 from typing import Annotated, Any
 
@@ -25,15 +27,13 @@ class Layers(SceneModel):
 
     base: Tensor
 
-    def __init__(self, components: Count = 3, width: Count = 8, fail_at: int | None = None) -> None:
+    def __init__(self, components: Count = 3, width: Count = 8) -> None:
         super().__init__()
         if components < 2:
             raise ValueError(f"components = {components} leaves no room for an object: give at least 2")
         self.components = components
-        self.fail_at = fail_at
         self.masks = nn.Sequential(nn.Conv2d(3, width, 3, padding=1), nn.ReLU(), nn.Conv2d(width, components, 1))
         self.register_buffer("base", torch.zeros(3, 1, 1))
-        self.calls = 0
 
     def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
         self.base.copy_(median.mean(dim=(1, 2), keepdim=True))
@@ -85,8 +85,24 @@ class Squares(Dataset[dict[str, Any]]):
         return {"video": video, "segmentation": segmentation, "index": index}
 
 
+class Steps:
+    """The batches of all steps that are left."""
+
+    def __init__(self, module: SquaresModule) -> None:
+        self._module = module
+
+    def __iter__(self) -> Iterator[list[int]]:
+        return self._module.order()
+
+    def __len__(self) -> int:
+        return self._module.max_steps - self._module.start_step
+
+
 class SquaresModule:
-    """Batches of `Squares`; the batches of a step depend on the seed and the step alone."""
+    """Batches of `Squares`; the batches of a step depend on the seed and the step alone.
+
+    The environment can slow it down (TINY_PAUSE, seconds per batch) or break it (TINY_BROKEN_AT, a step).
+    """
 
     def __init__(
         self,
@@ -116,14 +132,17 @@ class SquaresModule:
         size = self.sets["train"].image_size
         return torch.full((3, size, size), 60 / 255)
 
-    def _order(self) -> Iterator[list[int]]:
+    def order(self) -> Iterator[list[int]]:
         count = len(self.sets["train"])
         for step in range(self.start_step, self.max_steps):
+            time.sleep(float(os.environ.get("TINY_PAUSE", 0)))
+            if step == int(os.environ.get("TINY_BROKEN_AT", -1)):
+                raise RuntimeError(f"the data broke at step {step}")
             generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
             yield torch.randint(0, count, (self.batch_size,), generator=generator).tolist()
 
     def train_dataloader(self) -> DataLoader[dict[str, Any]]:
-        return DataLoader(self.sets["train"], batch_sampler=list(self._order()))
+        return DataLoader(self.sets["train"], batch_sampler=Steps(self))
 
     def loader(self, split: str, videos: int | None = None) -> DataLoader[dict[str, Any]]:
         data = self.sets[split]

@@ -24,8 +24,8 @@ class _ToStream(logging.Handler):
 def setup() -> None:
     """Sends messages to the terminal and quietens libraries that report on themselves."""
     if not any(isinstance(handler, _ToStream) for handler in _LOG.handlers):
-        _LOG.addHandler(_ToStream())
-    _LOG.setLevel(logging.INFO)
+        _LOG.addHandler(_ToStream(logging.INFO))
+    _LOG.setLevel(logging.DEBUG)
     _LOG.propagate = False
     for name in ("lightning.pytorch", "lightning.fabric", "lightning"):
         logging.getLogger(name).setLevel(logging.WARNING)
@@ -33,6 +33,11 @@ def setup() -> None:
     warnings.filterwarnings("ignore", message=".*No device id is provided.*")
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")
     warnings.filterwarnings("ignore", message=".*GPU available but not used.*")
+
+
+def note(message: str) -> None:
+    """For log.txt alone."""
+    _LOG.debug(message)
 
 
 def say(message: str) -> None:

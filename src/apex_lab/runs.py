@@ -145,6 +145,8 @@ class Run:
     def start(self, command: str, device: torch.device) -> None:
         """Records that work begins (or goes on) and with what."""
         make_folder(self.folder / "checkpoints")
+        for part in self.folder.rglob(".*.part"):
+            part.unlink()  # left by a kill in the middle of writing
         commit, dirty = provenance.commit()
         started = self.record.get("started", _now())
         choices, config = self.job.choices, self.job.config

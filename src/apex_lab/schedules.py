@@ -6,6 +6,7 @@ step: a resumed run sees the same values as an unbroken one.
 
 from __future__ import annotations
 
+import itertools
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -96,7 +97,7 @@ class Piecewise(Schedule):
     def __post_init__(self) -> None:
         if not self.steps or len(self.steps) != len(self.values):
             raise ValueError(f"steps has {len(self.steps)} entries, values {len(self.values)}: give one value per step")
-        if any(a >= b for a, b in zip(self.steps, self.steps[1:], strict=False)):
+        if any(a >= b for a, b in itertools.pairwise(self.steps)):
             raise ValueError(f"steps = {list(self.steps)} must increase from entry to entry")
 
     def __call__(self, step: int) -> float:

@@ -7,6 +7,7 @@ python -m apex_lab.train +ablation=no_entropy seed=0,1,2,3 scale=cpu -m
 from __future__ import annotations
 
 import time
+import traceback
 from typing import Any
 
 import lightning as L
@@ -56,20 +57,21 @@ def train(job: Job) -> None:
             return
         device = device_of(job.config.trainer.accelerator)
         run.start(cli.command_line(), device)
-        try:
-            with console.log_to(run.folder / "log.txt"):
+        with console.log_to(run.folder / "log.txt"):
+            try:
                 _train(run, device)
-        except UserError as error:
-            run.fail(str(error))
-            raise
-        except Interrupted as stop:
-            run.fail(f"stopped by {stop}")
-            raise
-        except BaseException as error:
-            run.fail(f"{type(error).__name__}: {one_line(error)}")
-            raise
-        run.finish()
-        _show(run)
+            except BaseException as error:
+                run.fail(_reason(error))
+                console.note(traceback.format_exc())
+                raise
+            run.finish()
+            _show(run)
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, UserError):
+        return str(error)
+    return f"stopped by {error}" if isinstance(error, Interrupted) else f"{type(error).__name__}: {one_line(error)}"
 
 
 def _train(run: Run, device: torch.device) -> None:
@@ -168,7 +170,7 @@ def _show(run: Run) -> None:
     """The row of scores and the pictures' paths."""
     for split, scored in read_json(run.metrics_file)["splits"].items():
         console.say(evaluation.summary(split, scored))
-    for path in sorted(run.view_folder.glob("*")):
+    for path in sorted(run.view_folder.glob("*"), key=lambda path: (path.stem != "film_strip", path.name)):
         console.say(str(path))
 
 

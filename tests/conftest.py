@@ -1,0 +1,81 @@
+"""What all tests share: one thread, a clean command line, and runs that end in a folder of the test's own."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import torch
+
+REPOSITORY = Path(__file__).parent.parent
+TINY = (
+    "--config-dir",
+    str(REPOSITORY / "tests" / "conf"),
+    "model=tiny",
+    "data=squares",
+    "scale=smoke",
+    "evaluation.pictures=0",
+)
+"""Words that train the tiny model of tests/tiny.py, without pictures."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread() -> None:
+    torch.set_num_threads(1)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a command ended: exit code and what it said."""
+
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., Ended]:
+    """Runs an entry point in this process, in the test's folder: command("train", "seed=1") -> `Ended`."""
+    import importlib
+
+    monkeypatch.chdir(tmp_path)
+    for name in [name for name in os.environ if name.startswith(("WANDB_", "APEX_LAB_", "TINY_"))]:
+        monkeypatch.delenv(name)
+
+    def run(entry: str, *words: str) -> Ended:
+        module = importlib.import_module(f"apex_lab.{entry}")
+        monkeypatch.setattr(sys, "argv", [str(module.__file__), *words])
+        capsys.readouterr()
+        code = 0
+        try:
+            module.main()
+        except SystemExit as stop:
+            code = stop.code if isinstance(stop.code, int) else 1
+        said = capsys.readouterr()
+        return Ended(code, said.out, said.err)
+
+    return run
+
+
+@pytest.fixture
+def train(command: Callable[..., Ended]) -> Callable[..., Ended]:
+    """Trains the tiny model: train("seed=1") -> `Ended`."""
+    return lambda *words: command("train", *TINY, *words)
+
+
+@pytest.fixture
+def the_run(tmp_path: Path) -> Callable[..., Path]:
+    """The only run folder (of a seed) that the test has made."""
+
+    def find(seed: int = 0) -> Path:
+        found = list((tmp_path / "outputs").glob(f"*/seed_{seed}"))
+        assert len(found) == 1, found
+        return found[0]
+
+    return find

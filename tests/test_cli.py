@@ -1,0 +1,100 @@
+"""What the command line refuses, in which words, and that nothing has been started then."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import TINY, Ended
+
+REFUSED = {
+    "trainer.max_step=3": r"Unknown key trainer.max_step = 3; did you mean 'trainer.max_steps'?",
+    "++trainer.max_step=3": r"Unknown key trainer.max_step = 3; did you mean 'trainer.max_steps'?",
+    "++typo=1": "Unknown key typo = 1.",
+    "+ablaton=no_entropy": "Unknown key ablaton = 'no_entropy'; did you mean 'ablation'?",
+    "modle=tiny": "Unknown key modle = 'tiny'; did you mean 'model'?",
+    "ablation=no_entropy": "ablation=no_entropy has no default to replace: write +ablation=no_entropy.",
+    "+seed=3": "seed is there already: write seed=3 without the +.",
+    "trainer.max_steps=abc": "trainer.max_steps = 'abc' is wrong: input should be a valid integer.",
+    "++trainer.max_steps=abc": "trainer.max_steps = 'abc' is wrong: input should be a valid integer.",
+    "trainer.max_steps=0": "trainer.max_steps = 0 is wrong: input should be greater than or equal to 1.",
+    "trainer.max_steps=2.5": "trainer.max_steps = 2.5 is wrong",
+    "trainer.compile=1": "trainer.compile = 1 is wrong: input should be a valid boolean.",
+    "trainer.precision=16": "trainer.precision = 16 is wrong: input should be 32 or 'bf16-mixed'.",
+    "trainer.monitor=ari": "trainer.monitor = 'ari' is wrong",
+    "seed=-1": "seed = -1 is wrong: input should be greater than or equal to 0.",
+    "seed=": "seed = '' is wrong: input should be a valid integer.",
+    "seed=null": "seed = null is wrong: input should be a valid integer.",
+    "paths.outputs=null": "paths.outputs = null is wrong: input should be a valid string.",
+    "optimizer.lr=abc": "optimizer.lr = 'abc' is wrong: input should be a valid number.",
+    "optimizer.lr=0": "optimizer.lr = 0 is wrong: a learning rate is above 0.",
+    "optimizer.lr=nan": "optimizer.lr = NaN is wrong: input should be a finite number.",
+    "++optimizer.lrr=3": "Unknown key optimizer.lrr = 3; did you mean 'lr'?",
+    "optimizer.weight_decay=0.1": "is set by no file that was chosen: write ++optimizer.weight_decay=0.1 to add it.",
+    "++optimizer.betas=[0.9,1.5]": "optimizer (torch.optim.Adam): Invalid beta parameter at index 1: 1.5.",
+    "optimizer=null": "optimizer = null, but the model has weights to train: choose one, such as torch.optim.Adam.",
+    "+model.component=3": "Unknown key model.component = 3; did you mean 'components'?",
+    "model.components=2.5": "model.components = 2.5 is wrong: input should be a valid integer.",
+    "model.components=1": "model (tests.tiny.Layers): components = 1 leaves no room for an object: give at least 2.",
+    "model._target_=tests.tiny.Layer": "model._target_ = 'tests.tiny.Layer' cannot be imported",
+    "model._target_=tests.tiny.SquaresModule": "Unknown key model.components = 3.",
+    "loss.spred=1": "Unknown key loss.spred: the model has error, spread; did you mean 'spread'?",
+    "~loss.spread": "loss.spread is missing: the model needs error, spread.",
+    "loss.error=x": "loss.error = 'x' is wrong",
+    "loss.error={a:1}": "loss.error = {'a': 1} is wrong: give a number or a schedule with a _target_.",
+    "~schedule.noise": "schedule.noise is missing: the model needs noise.",
+    "schedule.noise.steps=-1": "schedule.noise.steps = -1 is wrong: input should be greater than or equal to 0.",
+    "data.frames=0": "data.frames = 0 is wrong: input should be greater than or equal to 1.",
+    "data.frames=???": "data.frames is missing: write data.frames=...",
+    "data.frames=${nope}": "Interpolation key 'nope' not found.",
+    "evaluation.split=tst": "evaluation.split = 'tst' is wrong: input should be 'train', 'val' or 'test'.",
+    "callbacks.progress.seconds=0": "callbacks.progress.seconds = 0 is wrong: input should be greater than 0.",
+    "logger=wand": "logger=wand: there is no such choice in csv, wandb; did you mean 'wandb'?",
+    "scale=cpuu": "did you mean 'cpu'?",
+    "+ablation=no_entropi": "did you mean 'no_entropy'?",
+    "words": "'words' cannot be read as key=value",
+    "x=[1": "'x=[1' cannot be read as key=value",
+}
+
+
+def refused(ended: Ended, told: str, folder: Path) -> None:
+    assert ended.code == 2
+    assert told in ended.err
+    assert len(ended.err.splitlines()) == 1
+    assert ended.out == ""
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("word", REFUSED)
+def test_refuses_before_anything_starts(word: str, train: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(train(word), REFUSED[word], tmp_path)
+
+
+def test_every_job_of_a_sweep_is_checked_before_the_first_starts(train: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(train("seed=0,1,-2,3", "-m"), "seed = -2 is wrong", tmp_path)
+    refused(train("model.components=2,3,1", "seed=range(2)", "-m"), "components = 1 leaves no room", tmp_path)
+
+
+def test_a_gpu_that_is_not_there(train: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    refused(train("trainer=gpu"), "PyTorch finds no CUDA device: use trainer=cpu or trainer=auto.", tmp_path)
+
+
+def test_the_option_m_may_stand_anywhere(train: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(train("seed=0", "-m", "trainer.max_steps=5,x"), "trainer.max_steps = 'x' is wrong", tmp_path)
+
+
+@pytest.mark.parametrize("words", [("--help",), ("--cfg", "job", "--resolve"), ("--info", "defaults")])
+def test_hydra_s_own_questions_are_answered(
+    words: tuple[str, ...], command: Callable[..., Ended], tmp_path: Path
+) -> None:
+    ended = command("train", *TINY, *words)
+    assert ended.code == 0
+    assert "max_steps: 6" in ended.out or "scale" in ended.out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_configuration_folder_that_is_not_there(command: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(command("train", "--config-dir", "nowhere"), "--config-dir nowhere is not a folder.", tmp_path)

@@ -1,0 +1,337 @@
+"""Runs from their first to their last word: finished, failed, stopped, killed, gone on with."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from filelock import FileLock
+
+from apex_lab import checkpoints
+from apex_lab.train import main
+from tests.conftest import REPOSITORY, TINY, Ended
+
+LONG = ("trainer.max_steps=60", "trainer.checkpoint_interval=7", "trainer.validation_interval=20")
+"""Enough steps to be killed among."""
+
+
+def record(run: Path) -> dict[str, Any]:
+    return json.loads((run / "run.json").read_text())
+
+
+def curves(run: Path) -> list[dict[str, str]]:
+    with open(run / "curves.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def without_speed(run: Path) -> list[dict[str, str]]:
+    return [{k: v for k, v in row.items() if k != "train/frames_per_second"} for row in curves(run)]
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["weights"]
+
+
+def start(folder: Path, *words: str, code: str = "from apex_lab.train import main; main()") -> subprocess.Popen[str]:
+    """Trains the tiny model in a process of its own, which can be killed."""
+    environment = {**os.environ, "PYTHONPATH": f"{REPOSITORY}", "OMP_NUM_THREADS": "1", "TINY_PAUSE": "0.05"}
+    return subprocess.Popen(
+        [sys.executable, "-c", code, *TINY, *words],
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for_step(folder: Path, step: int) -> Path:
+    """Waits until a run has stored a step."""
+    for _ in range(6000):
+        for file in folder.glob("outputs/*/seed_0/run.json"):
+            if record(file.parent)["steps"] >= step:
+                return file.parent
+        time.sleep(0.01)
+    raise AssertionError("the run did not get so far")
+
+
+def test_a_run_leaves_everything_and_says_so(train: Callable[..., Ended], the_run: Callable[..., Path]) -> None:
+    ended = train("evaluation.pictures=2")
+    run = the_run()
+    assert ended.code == 0
+    assert run.parent.name.startswith("tiny_squares_smoke_")
+    about = record(run)
+    assert about["status"] == "finished"
+    assert (about["model"], about["ablation"], about["data"], about["scale"]) == ("tiny", None, "squares", "smoke")
+    assert (about["seed"], about["steps"]) == (0, 6)
+    assert about["command"].startswith("python -m apex_lab.train --config-dir")
+    assert about["versions"]["torch"] == torch.__version__
+    assert about["hardware"]["device"] in ("cpu", "cuda")
+    names = ("config.yaml", "metrics.json", "objects.csv", "curves.csv", "log.txt", "checkpoints/last.ckpt")
+    for name in (*names, "checkpoints/best.ckpt", "view/film_strip.png", "view/movie.mp4", "view/movie.gif"):
+        assert (run / name).stat().st_size > 0, name
+    total = json.loads((run / "metrics.json").read_text())["splits"]["test"]["total"]
+    lines = ended.out.splitlines()
+    heading = next(i for i, line in enumerate(lines) if line.split() == ["ARI-FG", "MSC-FG", "ARI", "MSC"])
+    row = [float(number) for number in lines[heading + 1].split()]
+    assert row == [round(total[key], 3) for key in ("ari_fg", "msc_fg", "ari", "msc")]
+    paths = lines[heading + 2 :]
+    assert paths[0].endswith("film_strip.png")
+    assert all((run.parents[2] / path).is_file() for path in paths)
+    assert [row["step"] for row in curves(run)] == ["1", "2", "3", "4", "5", "6"]
+
+
+def test_a_finished_run_does_no_work_again(train: Callable[..., Ended], the_run: Callable[..., Path]) -> None:
+    first = train()
+    run = the_run()
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name != ".lock"}
+    again = train("trainer.log_interval=2", "trainer=cpu")
+    assert again.code == 0
+    assert again.out.splitlines()[0] == f"finished already: {run.relative_to(run.parents[2])}"
+    assert again.out.splitlines()[-3:] == first.out.splitlines()[-3:]
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name != ".lock"} == before
+
+
+def test_another_configuration_is_another_run(train: Callable[..., Ended], tmp_path: Path) -> None:
+    for words in ([], ["optimizer.lr=0.02"], ["seed=1"], ["+experiment=overfit"]):
+        assert train(*words).code == 0
+    runs = sorted(path.relative_to(tmp_path).parts for path in tmp_path.glob("outputs/*/seed_*"))
+    assert len(runs) == 4
+    assert len({group for _, group, _ in runs}) == 3
+
+
+def test_four_seeds_make_four_runs_and_a_second_start_none(train: Callable[..., Ended], tmp_path: Path) -> None:
+    words = ("seed=0,1,2,3", "-m")
+    assert train(*words).code == 0
+    runs = list(tmp_path.glob("outputs/*/seed_*"))
+    assert [record(run)["status"] for run in runs] == ["finished"] * 4
+    assert len({run.parent for run in runs}) == 1
+    again = train(*words)
+    assert again.code == 0
+    assert again.out.count("finished already: ") == 4
+
+
+def test_one_failing_job_does_not_stop_the_others(train: Callable[..., Ended], tmp_path: Path) -> None:
+    # a weight this large makes the loss overflow
+    ended = train("loss.error=1.0,1e38,2.0", "-m")
+    assert ended.code == 1
+    status = sorted(record(run)["status"] for run in tmp_path.glob("outputs/*/seed_0"))
+    assert status == ["failed", "finished", "finished"]
+    failed = next(run for run in tmp_path.glob("outputs/*/seed_0") if record(run)["status"] == "failed")
+    assert "train/loss is inf at step 1 (not finite:" in record(failed)["reason"]
+    assert not (failed / "checkpoints" / "last.ckpt").exists()
+    assert ended.err.splitlines()[-2] == "Failed:"
+    assert failed.parent.name in ended.err.splitlines()[-1]
+
+
+def test_an_unexpected_error_is_recorded(
+    train: Callable[..., Ended], the_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TINY_BROKEN_AT", "3")
+    ended = train()
+    assert ended.code == 1
+    assert "Traceback" in ended.err
+    assert record(the_run())["status"] == "failed"
+    assert record(the_run())["reason"] == "RuntimeError: the data broke at step 3"
+    assert "the data broke" in (the_run() / "log.txt").read_text()
+
+
+def test_two_processes_cannot_have_the_same_run(train: Callable[..., Ended], the_run: Callable[..., Path]) -> None:
+    train()
+    with FileLock(str(the_run() / ".lock")):
+        ended = train()
+    assert ended.code == 1
+    assert "is being worked on by another process: wait for it or stop it." in ended.err
+
+
+def test_the_same_seed_gives_the_same_curves(train: Callable[..., Ended], tmp_path: Path) -> None:
+    train()
+    train(f"paths.outputs={tmp_path / 'again'}")
+    first, second = next(tmp_path.glob("outputs/*/seed_0")), next(tmp_path.glob("again/*/seed_0"))
+    assert without_speed(first) == without_speed(second)
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A longer run that nothing has stopped."""
+    folder = tmp_path_factory.mktemp("unbroken")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.chdir(folder)
+        patched.setattr(sys, "argv", ["train", *TINY, *LONG])
+        main()
+    return next(folder.glob("outputs/*/seed_0"))
+
+
+def equal(run: Path, other: Path) -> None:
+    """Two runs ended with the same weights, scores and curves."""
+    ours, theirs = weights(run), weights(other)
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    best, other_best = (checkpoints.load(path / "checkpoints" / "best.ckpt") for path in (run, other))
+    assert best["step"] == other_best["step"]
+    scores = [json.loads((path / "metrics.json").read_text())["splits"] for path in (run, other)]
+    assert scores[0] == scores[1]
+    assert without_speed(run) == without_speed(other)
+
+
+def test_killed_in_training_the_same_command_ends_as_unbroken(
+    train: Callable[..., Ended], unbroken: Path, tmp_path: Path
+) -> None:
+    process = start(tmp_path, *LONG)
+    run = wait_for_step(tmp_path, 25)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert record(run)["status"] == "running"
+    ended = train(*LONG)
+    assert ended.code == 0
+    assert "going on from step" in ended.out
+    assert record(run)["status"] == "finished"
+    equal(run, unbroken)
+
+
+KILLED_WRITING = """
+import os, signal
+from apex_lab import files
+calls, place = 0, os.{function}
+def killing(*arguments):
+    global calls
+    calls += 'ckpt' in str(arguments) or '{function}' == 'fsync'
+    if calls == {call}:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return place(*arguments)
+os.{function} = killing
+from apex_lab.train import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("function", "call"),
+    [
+        ("fsync", 40),
+        pytest.param("replace", 9, marks=pytest.mark.slow),
+        pytest.param("replace", 10, marks=pytest.mark.slow),
+    ],
+)
+def test_killed_while_writing_a_checkpoint(
+    function: str, call: int, train: Callable[..., Ended], unbroken: Path, tmp_path: Path
+) -> None:
+    process = start(tmp_path, *LONG, code=KILLED_WRITING.format(function=function, call=call))
+    process.communicate()
+    assert process.returncode == -signal.SIGKILL
+    run = next(tmp_path.glob("outputs/*/seed_0"))
+    assert record(run)["status"] == "running"
+    assert train(*LONG).code == 0
+    equal(run, unbroken)
+    assert list(run.rglob("*.part")) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
+)
+def test_asked_to_stop_it_stores_the_step_at_hand(
+    number: signal.Signals, code: int, train: Callable[..., Ended], unbroken: Path, tmp_path: Path
+) -> None:
+    rare = (*LONG, "trainer.checkpoint_interval=10000")
+    process = start(tmp_path, *rare)
+    run = wait_for_step(tmp_path, 20)
+    time.sleep(0.2)
+    process.send_signal(number)
+    _, err = process.communicate()
+    assert process.returncode == code
+    assert f"Stopped by {number.name}; the same command goes on from here." in err
+    assert record(run)["status"] == "failed"
+    assert record(run)["reason"] == f"stopped by {number.name}"
+    assert checkpoints.load(run / "checkpoints" / "last.ckpt")["step"] == record(run)["steps"] > 20
+    assert train(*rare).code == 0
+    equal(run, unbroken)
+
+
+def test_a_damaged_last_checkpoint_is_told_and_the_one_before_taken(
+    train: Callable[..., Ended], the_run: Callable[..., Path], unbroken: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TINY_BROKEN_AT", "30")
+    assert train(*LONG).code == 1
+    run = the_run()
+    last = run / "checkpoints" / "last.ckpt"
+    last.write_bytes(last.read_bytes()[:-200])
+    monkeypatch.delenv("TINY_BROKEN_AT")
+    ended = train(*LONG)
+    assert ended.code == 0
+    assert f"{last.relative_to(run.parents[2])} is no checkpoint, or its end is missing" in ended.err
+    assert "going on from step 21" in ended.out
+    equal(run, unbroken)
+
+
+def test_without_a_whole_checkpoint_nothing_is_started_anew(
+    train: Callable[..., Ended], the_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TINY_BROKEN_AT", "5")
+    assert train().code == 1
+    for path in (the_run() / "checkpoints").glob("*.ckpt"):
+        path.write_bytes(b"")
+    ended = train()
+    assert ended.code == 1
+    assert f"No whole checkpoint is left in {the_run().relative_to(the_run().parents[2])}/checkpoints" in ended.err
+
+
+def test_other_data_are_refused_on_going_on(
+    train: Callable[..., Ended], the_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TINY_BROKEN_AT", "5")
+    assert train().code == 1
+    about = record(the_run())
+    (the_run() / "run.json").write_text(json.dumps({**about, "data_fingerprint": "0" * 64}))
+    ended = train()
+    assert ended.code == 1
+    assert "was begun with other data (fingerprint 00000000, now" in ended.err
+
+
+def test_a_full_disk_is_told_and_the_checkpoint_before_stays(
+    train: Callable[..., Ended], the_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = torch.save
+
+    def full(content: dict[str, Any], file: Any) -> None:
+        if content["step"] > 2:
+            raise OSError(28, "No space left on device")
+        real(content, file)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(torch, "save", full)
+        ended = train()
+    assert ended.code == 1
+    assert ended.err.count("No space left for") == 2  # as it happens, and in the list of failures
+    assert "Traceback" not in ended.err
+    assert record(the_run())["status"] == "failed"
+    assert checkpoints.load(the_run() / "checkpoints" / "last.ckpt")["step"] == 2
+    assert train().code == 0
+
+
+def test_long_training_on_a_cpu_is_announced(
+    train: Callable[..., Ended], monkeypatch: pytest.MonkeyPatch, the_run: Callable[..., Path]
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr("apex_lab.train.LONG", 0.0)
+    ended = train()
+    assert ended.code == 0
+    assert "Training will take about" in ended.err
+    assert "python -m apex_lab.train scale=cpu" in ended.err
+
+
+def test_a_model_that_does_not_train_is_evaluated(command: Callable[..., Ended], the_run: Callable[..., Path]) -> None:
+    ended = command("train", *TINY, "model=one_segment")
+    assert ended.code == 0
+    assert record(the_run())["status"] == "finished"
+    assert (the_run() / "checkpoints" / "last.ckpt").is_file()
+    assert not (the_run() / "curves.csv").exists()
