@@ -6,6 +6,9 @@ program on purpose: masks are compared as arrays of known size, the background i
 place in a list, and identities cannot meet across videos, because each video has its own accumulator; counts of
 videos are then added up, which is the same as one accumulator over all videos with identities made unique.
 
+MD can never be smaller than MT. In the paper's table it is, in every row, so its two column titles are evidently
+exchanged: our MD is to be compared with the column that the paper calls MT, and the reverse.
+
 Legend: T frames, G true regions (row 0 is the background), P predicted identities, n and m those left in a frame.
 """
 
