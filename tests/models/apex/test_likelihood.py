@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from apex_lab.models.apex.likelihood import GaussianLikelihood, MixtureLikelihood
+from apex_lab.models.apex.likelihood import GaussianLikelihood, MixtureLikelihood, log_normal
 
 
 def case(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
@@ -75,3 +75,22 @@ def test_both_agree_where_one_component_owns_every_pixel() -> None:
     a = MixtureLikelihood(0.1, 0.2)(image, logs, means, only_background, background)
     b = GaussianLikelihood(0.2)(image, logs, means, only_background, background)
     torch.testing.assert_close(a, b)
+
+
+def test_the_gradient_written_by_hand_equals_autograd_and_finite_differences() -> None:
+    inputs = [x.clone().requires_grad_(x.isfinite().all().item()) for x in case()]
+    likelihood = MixtureLikelihood(0.4, 0.2)
+    likelihood(*inputs).sum().backward()
+    by_hand = [x.grad for x in inputs]
+    again = [x.detach().clone().requires_grad_(x.requires_grad) for x in inputs]
+    image, log_objects, means, log_background, background = again
+    parts = log_normal(image[:, None], means, 0.4) + log_objects[:, :, None]
+    back = log_normal(image, background, 0.2) + log_background[:, None]
+    torch.logsumexp(torch.cat([parts, back[:, None]], 1), 1).sum().backward()
+    for got, want in zip(by_hand, [x.grad for x in again], strict=True):
+        assert (got is None) == (want is None)
+        if got is not None and want is not None:
+            torch.testing.assert_close(got, want)
+    small = [x.detach()[..., :2, :2] for x in inputs]
+    small[1] = small[1].clamp_min(-20)
+    assert torch.autograd.gradcheck(likelihood, [x.clone().requires_grad_() for x in small])
