@@ -14,7 +14,6 @@ import typing
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from hydra.utils import instantiate
 from pydantic import ConfigDict, create_model
 from pydantic.errors import PydanticSchemaGenerationError, PydanticUndefinedAnnotation
 
@@ -86,20 +85,28 @@ def check(node: Node, key: str, supplied: Iterable[str] = ()) -> None:
 
 
 def build(node: Node, key: str, **supplied: Any) -> Any:
-    """Builds a checked component; what its constructor refuses becomes one sentence.
+    """Builds a checked component and all components inside it; what a constructor refuses becomes one sentence.
 
     Raises:
-        UserError: the constructor raised ValueError, TypeError or UserError.
+        UserError: a constructor raised ValueError, TypeError or UserError.
     """
+    arguments = {name: _build_inside(value, f"{key}.{name}") for name, value in node.items() if name != "_target_"}
     try:
-        return instantiate(dict(node), _convert_="all", **supplied)
-    except Exception as error:
-        cause = error.__cause__ or error
-        if isinstance(cause, UserError):
-            raise UserError(sentence(f"{key}: {one_line(cause)}")) from error
-        if isinstance(cause, (ValueError, TypeError)):
-            raise UserError(sentence(f"{key} ({node['_target_']}): {one_line(cause)}")) from error
-        raise
+        return target_of(node, key)(**arguments, **supplied)
+    except UserError as error:
+        raise UserError(sentence(f"{key}: {one_line(error)}")) from error
+    except (ValueError, TypeError) as error:
+        raise UserError(sentence(f"{key} ({node['_target_']}): {one_line(error)}")) from error
+
+
+def _build_inside(value: Any, key: str) -> Any:
+    if isinstance(value, Mapping):
+        if is_node(value):
+            return build(value, key)
+        return {name: _build_inside(item, f"{key}.{name}") for name, item in value.items()}
+    if isinstance(value, list):
+        return [_build_inside(item, f"{key}[{i}]") for i, item in enumerate(value)]
+    return value
 
 
 def _parameters(target: Callable[..., Any], supplied: set[str]) -> tuple[dict[str, Any], bool]:

@@ -81,6 +81,10 @@ class Curves(Logger):
         write_text(self.path, text.getvalue())
 
 
+TIMEOUT = 30.0
+"""Seconds that wandb's server has to answer before a run is logged offline; ten times that for the last upload."""
+
+
 class Wandb(Logger):
     """Weights & Biases; a network that is away or credentials that are missing never stop a run.
 
@@ -131,7 +135,14 @@ class Wandb(Logger):
             "resume": "allow" if self._id else None,
             "reinit": "finish_previous",
         }
-        settings = wandb.Settings(init_timeout=30, console="off", disable_git=True, save_code=False)
+        settings = wandb.Settings(
+            init_timeout=TIMEOUT,
+            finish_timeout=10 * TIMEOUT,
+            finish_timeout_raises=False,
+            console="off",
+            disable_git=True,
+            save_code=False,
+        )
         try:
             started = wandb.init(mode=mode, settings=settings, **words)
         except Exception as error:
@@ -151,8 +162,14 @@ class Wandb(Logger):
         """Nothing: the configuration is sent at the start."""
 
     def finalize(self, status: str) -> None:
-        """Ends wandb's run."""
-        self._wandb.finish(exit_code=0 if status == "success" else 1, quiet=True)
+        """Ends wandb's run if training failed; else it waits for the scores (`end`)."""
+        if status != "success":
+            self._wandb.finish(exit_code=1)
+
+    def end(self, scores: dict[str, float]) -> None:
+        """Sends the final scores and ends wandb's run."""
+        self._wandb.summary.update(scores)
+        self._wandb.finish()
 
 
 def credentials() -> bool:

@@ -151,12 +151,12 @@ class Run:
         started = self.record.get("started", _now())
         choices, config = self.job.choices, self.job.config
         self.record = {
+            **self.record,
             "status": "running",
             "reason": None,
             "started": started,
-            "resumed": _now() if "started" in self.record else None,
             "finished": None,
-            "seconds": self.record.get("seconds", 0.0),
+            "seconds": self.record.get("seconds", 0.0),  # of training, over all restarts
             "steps": self.record.get("steps", 0),
             "command": command,
             "overrides": list(self.job.overrides),

@@ -12,6 +12,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.loggers import Logger
 
 from apex_lab import callbacks, checkpoints, cli, components, console, evaluation
 from apex_lab.config import (
@@ -28,7 +29,7 @@ from apex_lab.errors import UserError
 from apex_lab.files import read_json
 from apex_lab.interrupts import Deferred, Interrupted, deferring
 from apex_lab.learner import Learner, Stretches
-from apex_lab.loggers import Curves
+from apex_lab.loggers import Curves, Wandb
 from apex_lab.runs import Run, group_name
 from apex_lab.scene import SceneModel, schedule_at
 from apex_lab.validation import one_line
@@ -90,14 +91,26 @@ def _train(run: Run, device: torch.device) -> None:
     else:
         model.load_state_dict(checkpoint["weights"])
         console.say(f"going on from step {checkpoint['step']}")
+    loggers: list[Logger] = []
     if model.needs_training:
-        _fit(run, model, data, checkpoint, device)
+        loggers = _loggers(run, checkpoint["step"] if checkpoint else 0)
+        _fit(run, model, data, checkpoint, loggers, device)
     else:
         checkpoints.save(run.last, _untrained(run, model))
-    _evaluate(run, model, data, device)
+    scores = _evaluate(run, model, data, device)
+    for logger in loggers:
+        if isinstance(logger, Wandb):
+            logger.end(scores)
 
 
-def _fit(run: Run, model: SceneModel, data: Any, checkpoint: dict[str, Any] | None, device: torch.device) -> None:
+def _fit(
+    run: Run,
+    model: SceneModel,
+    data: Any,
+    checkpoint: dict[str, Any] | None,
+    loggers: list[Logger],
+    device: torch.device,
+) -> None:
     """All weight updates that are left."""
     config, settings = run.job.config, run.job.config.trainer
     start = checkpoint["step"] if checkpoint else 0
@@ -125,7 +138,7 @@ def _fit(run: Run, model: SceneModel, data: Any, checkpoint: dict[str, Any] | No
         model.compile()
     data.start_step, data.max_steps = start, settings.max_steps
     with deferring() as deferred:
-        _trainer(run, start, training, deferred, device).fit(
+        _trainer(run, start, training, deferred, loggers, device).fit(
             learner,
             Stretches(data.train_dataloader(), learner, settings.validation_interval),
             data.loader("val", settings.validation_videos) if settings.validation_interval is not None else None,
@@ -133,7 +146,12 @@ def _fit(run: Run, model: SceneModel, data: Any, checkpoint: dict[str, Any] | No
 
 
 def _trainer(
-    run: Run, start: int, training: dict[str, Any] | None, deferred: Deferred, device: torch.device
+    run: Run,
+    start: int,
+    training: dict[str, Any] | None,
+    deferred: Deferred,
+    loggers: list[Logger],
+    device: torch.device,
 ) -> L.Trainer:
     settings = run.job.config.trainer
     return L.Trainer(
@@ -143,7 +161,7 @@ def _trainer(
         max_epochs=-1,
         max_steps=settings.max_steps - start,
         num_sanity_val_steps=0,
-        logger=_loggers(run, start),
+        logger=loggers,
         callbacks=_callbacks(run, training, deferred),
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -154,8 +172,8 @@ def _trainer(
     )
 
 
-def _evaluate(run: Run, model: SceneModel, data: Any, device: torch.device) -> None:
-    """Scores and pictures of the final weights, in the run's folder."""
+def _evaluate(run: Run, model: SceneModel, data: Any, device: torch.device) -> dict[str, float]:
+    """Scores and pictures of the final weights, in the run's folder; the paper's four scores."""
     config = run.job.config
     asked = config.evaluation
     schedule = schedule_at({n: s(config.trainer.max_steps) for n, s in build_schedules(config).items()}, device)
@@ -163,7 +181,9 @@ def _evaluate(run: Run, model: SceneModel, data: Any, device: torch.device) -> N
     batches = data.loader(asked.split, asked.videos)
     evaluator, items = evaluation.evaluate(model, batches, schedule, device, config.trainer.precision, asked.pictures)
     evaluation.draw(run.view_folder, items, run.curves_file)
-    evaluation.store(run.folder, asked.split, evaluator, asked.model_dump())
+    stored = evaluation.store(run.folder, asked.split, evaluator, asked.model_dump())
+    total = read_json(stored)["splits"][asked.split]["total"]
+    return {f"{asked.split}/{key}": total[key] for key in evaluation.COLUMNS}
 
 
 def _show(run: Run) -> None:
@@ -205,7 +225,7 @@ def _compare_data(run: Run, found: str, checkpoint: dict[str, Any] | None) -> No
     run.update(data_fingerprint=found)
 
 
-def _loggers(run: Run, step: int) -> list[Any]:
+def _loggers(run: Run, step: int) -> list[Logger]:
     config = run.job.config
     built = [
         components.build(
