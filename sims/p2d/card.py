@@ -15,7 +15,7 @@ from sims.p2d.verify import check
 
 STRIPS = 10
 SAMPLES = 6
-QUALITY = 87
+QUALITY = 82
 
 
 def write_card(root: Path, out: Path) -> Path:

@@ -236,8 +236,13 @@ def no_room(error: OSError, path: Path | str) -> SimError:
 def _reserve(file: int, size: int) -> None:
     """Takes the room of a file on the disk at once, so that a full disk is found before the work and not during it."""
     reserve: Callable[[int, int, int], None] | None = getattr(os, "posix_fallocate", None)
-    if reserve is not None:  # absent on macOS
+    if reserve is None:  # macOS
+        return
+    try:
         reserve(file, 0, size)
+    except OSError as error:
+        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):  # not every file system can
+            raise
 
 
 def _missing_bytes(root: Path, settings: Settings) -> int:
