@@ -10,6 +10,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from apex_lab.config import Job, check_job, conf_dir, plain
 
 REPOSITORY = Path(__file__).parent.parent
 TINY = (
@@ -61,6 +65,18 @@ def command(
         return Ended(code, said.out, said.err)
 
     return run
+
+
+def compose_job(*words: str) -> Job:
+    """The checked job of a command line of `train`, the tiny model by default."""
+    defaults = ("model=tiny", "data=squares", "scale=smoke")
+    chosen = [word.split("=")[0] for word in words]
+    overrides = [*(word for word in defaults if word.split("=")[0] not in chosen), *words]
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        search = f"hydra.searchpath=[file://{REPOSITORY / 'tests' / 'conf'}]"
+        config = compose("train", overrides=[search, *overrides], return_hydra_config=True)
+    choices = {name: word for name, word in config.hydra.runtime.choices.items() if word and "hydra/" not in name}
+    return check_job(plain(OmegaConf.masked_copy(config, [key for key in config if key != "hydra"])), choices)
 
 
 @pytest.fixture

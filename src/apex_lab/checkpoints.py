@@ -39,7 +39,7 @@ def save(path: Path, checkpoint: dict[str, Any], keep_previous: bool = False) ->
     """
     content = {"format": FORMAT, **checkpoint}
     assert set(content) == _KEYS
-    with replacing(path) as file:
+    with replacing(path, keep=previous(path) if keep_previous else None) as file:
         try:
             torch.save(content, file)
         except RuntimeError as error:
@@ -47,9 +47,6 @@ def save(path: Path, checkpoint: dict[str, Any], keep_previous: bool = False) ->
             if isinstance(error.__context__, OSError):
                 raise unwritable(path, error.__context__) from error
             raise
-        if keep_previous and path.exists():
-            file.flush()
-            path.replace(previous(path))
 
 
 def previous(path: Path) -> Path:

@@ -14,8 +14,12 @@ from apex_lab.errors import UserError
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[IO[bytes]]:
+def replacing(path: Path, keep: Path | None = None) -> Iterator[IO[bytes]]:
     """A file to write in place of `path`; `path` changes only when everything is on the disk.
+
+    Args:
+        path: the file.
+        keep: where the file that was there before goes; None: nowhere.
 
     Raises:
         UserError: the disk is full or the folder cannot be written; `path` is as it was before.
@@ -26,6 +30,8 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
             yield file
             file.flush()
             os.fsync(file.fileno())
+        if keep is not None and path.exists():
+            os.replace(path, keep)
         os.replace(part, path)
         _sync_folder(path.parent)
     except OSError as error:

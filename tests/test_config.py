@@ -1,0 +1,73 @@
+"""Every shipped file composes into a configuration that can be built."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from apex_lab.config import build_model, conf_dir
+from tests.conftest import REPOSITORY, compose_job
+
+
+def words(group: str) -> list[str]:
+    return sorted(path.stem for path in (REPOSITORY / "conf" / group).glob("*.yaml") if path.stem[0] != "_")
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("model", words("model"))
+@pytest.mark.parametrize("scale", words("scale"))
+def test_every_model_at_every_scale(model: str, scale: str) -> None:
+    job = compose_job(f"model={model}", f"scale={scale}", "data=p2d")
+    assert (job.choices["model"], job.choices["scale"]) == (model, scale)
+
+
+@pytest.mark.parametrize("group", ["ablation", "experiment"])
+def test_every_fragment(group: str) -> None:
+    for word in words(group):
+        job = compose_job("model=apex", "scale=cpu", "data=p2d", f"+{group}={word}")
+        assert job.choices[group] == word
+
+
+@pytest.mark.parametrize("group", ["logger", "callbacks", "paths", "data"])
+def test_every_choice(group: str) -> None:
+    for word in words(group):
+        assert compose_job(f"{group}={word}").choices[group] == word
+
+
+def test_a_scale_is_the_size_that_it_says() -> None:
+    paper = compose_job("scale=paper", "data=p2d", "model=apex").config
+    assert (paper.data["image_size"], paper.data["frames"], paper.data["batch_size"]) == (128, 20, 4)
+    assert (paper.data["train"], paper.data["val"], paper.data["test"]) == (2000, 200, 200)
+    assert paper.trainer.max_steps == 40000
+    cpu = compose_job("scale=cpu", "data=p2d", "model=apex").config
+    assert (cpu.data["image_size"], cpu.data["frames"]) == (64, 8)
+
+
+def test_paper_is_the_default() -> None:
+    defaults = yaml.safe_load((conf_dir() / "train.yaml").read_text())["defaults"]
+    assert {"scale": "paper"} in defaults
+    assert {"model": "apex"} in defaults
+
+
+def test_weights_come_from_the_seed_alone() -> None:
+    import torch
+
+    first = build_model(compose_job("seed=1").config).state_dict()
+    torch.rand(7)
+    state = torch.get_rng_state()
+    again = build_model(compose_job("seed=1").config).state_dict()
+    assert torch.equal(torch.get_rng_state(), state)
+    other = build_model(compose_job("seed=2").config).state_dict()
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert not all(torch.equal(first[name], other[name]) for name in first)
+
+
+def test_conf_is_found_by_an_absolute_path() -> None:
+    assert conf_dir().is_absolute()
+    assert (conf_dir() / "evaluate.yaml").is_file()
