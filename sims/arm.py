@@ -5,15 +5,17 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 from PIL import Image
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
 
 from sims import meshes, surfaces
+from sims.bullet import Client, load_pybullet_data
 from sims.cache import file_hash, made_once
-from sims.bullet import load_pybullet_data
+from sims.poses import rotation
 
 FACES = {
     "panda_link0": 200,
@@ -30,11 +32,13 @@ FACES = {
 }
 """Triangles kept of each drawn link, of 101,735 in all."""
 CELL_PX = 10
+IK_CALLS, IK_ERROR_M = 30, 2e-4
+"""PyBullet's solver creeps: it is asked again from where it got to, until it is near enough."""
 POINTS_PER_M2 = 400_000
 
 JOINTS = (0, 1, 2, 3, 4, 5, 6, 9, 10)
 """PyBullet's indices of the seven arm joints and the two fingers."""
-HAND_LINK = 8
+BASE_LINK = "panda_link0"
 GRASP_LINK = 11
 """The point between the fingertips, 0.105 m from the hand's flange."""
 REST_RAD = (0.0, 0.3, 0.0, -2.2, 0.0, 2.5, 0.785)
@@ -46,17 +50,39 @@ FORCE_N = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0, 20.0, 20.0)
 
 @dataclass(frozen=True)
 class ArmModel:
-    """Two URDFs of the same kinematics: one to draw (few faces, no contacts), one to touch (hulls, nothing drawn).
+    """URDFs of the same kinematics: as it comes, to draw (few faces, no contacts), to touch (hulls, nothing drawn).
 
     Attributes:
-        visual: URDF for a renderer.
-        physics: URDF for a simulator.
-        boxes: link index -> (8, 3) corners of the visual mesh's bounding box in the link's frame, metres.
+        original: PyBullet's own URDF.
+        visual: URDF for a stage.
+        physics: URDF for a world.
+        hulls: link name -> (N, 3) metres, vertices of the drawn link's convex hull in the link's frame.
     """
 
+    original: Path
     visual: Path
     physics: Path
-    boxes: dict[int, np.ndarray]
+    hulls: dict[str, np.ndarray]
+
+
+class Links:
+    """Where the drawn links are."""
+
+    def __init__(self, model: ArmModel) -> None:
+        self._hulls = model.hulls
+        self._order: list[tuple[int, np.ndarray]] = []
+
+    def points(self, bullet: Client, arm: int) -> list[np.ndarray]:
+        """World vertices (N, 3) of every link's hull, in metres, base first."""
+        if not self._order:
+            count = bullet.call("getNumJoints", arm)
+            names = [bullet.call("getJointInfo", arm, joint)[12].decode() for joint in range(count)]
+            self._order = [(i, self._hulls[name]) for i, name in enumerate(names) if name in self._hulls]
+        states = bullet.call("getLinkStates", arm, [i for i, _ in self._order], computeForwardKinematics=True)
+        points = [self._hulls[BASE_LINK]]
+        for (_, hull), state in zip(self._order, states, strict=True):
+            points.append(hull @ rotation(state[5]).T + state[4])
+        return points
 
 
 def arm_model() -> ArmModel:
@@ -70,74 +96,62 @@ def arm_model() -> ArmModel:
         "sources": {str(path.relative_to(source)): file_hash(path) for path in sources},
     }
     folder = made_once("panda", recipe, lambda target: _make(source, target))
-    boxes = np.load(folder / "boxes.npz")
-    return ArmModel(folder / "visual.urdf", folder / "physics.urdf", {int(link): boxes[link] for link in boxes.files})
+    hulls = np.load(folder / "hulls.npz")
+    files = source / "panda.urdf", folder / "visual.urdf", folder / "physics.urdf"
+    return ArmModel(*files, {name: hulls[name] for name in hulls.files})
 
 
 def _make(source: Path, target: Path) -> None:
-    tree = ElementTree.parse(source / "panda.urdf")
-    links = [link.get("name") for link in tree.getroot().findall("link")]
-    child_of = [joint.find("child").get("link") for joint in tree.getroot().findall("joint")]  # type: ignore[union-attr]
-    _check_order(links, child_of)
-    boxes: dict[str, np.ndarray] = {}
-    for element in tree.getroot().iter("mesh"):
-        element.set("filename", element.get("filename", "").removeprefix("package://"))
-    for link in tree.getroot().findall("link"):
-        drawn = link.find("visual")
-        if drawn is None:
-            continue
-        mesh = drawn.find("geometry/mesh")
-        assert mesh is not None
-        name = f"{link.get('name')}"
-        corners = _redraw(source / mesh.get("filename", ""), target / f"{name}.obj")
-        if drawn.find("origin") is not None and link.get("name") == "panda_rightfinger":
-            corners = corners * [-1, -1, 1]
-        boxes[str(child_of.index(name) if name in child_of else -1)] = corners
-        mesh.set("filename", f"{name}.obj")
-    _write_without(tree, "collision", target / "visual.urdf")
-    tree = ElementTree.parse(source / "panda.urdf")
-    for link in tree.getroot().findall("link"):
-        touched = link.find("collision/geometry/mesh")
-        if touched is None:
-            continue
-        path = source / touched.get("filename", "").removeprefix("package://")
-        points = np.asarray(trimesh.load(path, force="mesh").vertices)
-        name = f"{link.get('name')}_hull.obj"
-        meshes.write_hulls(target / name, [meshes.hull_vertices(points, 100)])
-        touched.set("filename", name)
-    _write_without(tree, "visual", target / "physics.urdf")
-    np.savez(target / "boxes.npz", **boxes)  # type: ignore[arg-type]
+    """Write both URDFs with their meshes, and the drawn links' hulls."""
+    hulls: dict[str, np.ndarray] = {}
+    for kind, other in (("visual", "collision"), ("collision", "visual")):
+        tree = ElementTree.parse(source / "panda.urdf")
+        for link in tree.findall("link"):
+            for part in link.findall(other):
+                link.remove(part)
+            part = link.find(kind)
+            mesh = None if part is None else part.find("geometry/mesh")
+            if part is None or mesh is None:
+                continue
+            name = str(link.get("name"))
+            original = source / str(mesh.get("filename")).removeprefix("package://")
+            mesh.set("filename", f"{name}_{kind}.obj")
+            if kind == "visual":
+                points = _redraw(original, target / f"{name}_visual.obj", FACES[name])
+                hulls[name] = _moved(points[ConvexHull(points).vertices], part.find("origin"))
+            else:
+                points = np.asarray(trimesh.load_mesh(original).vertices)
+                meshes.write_hulls(target / f"{name}_collision.obj", [meshes.hull_vertices(points, 100)])
+        tree.write(target / {"visual": "visual.urdf", "collision": "physics.urdf"}[kind])
+    np.savez(target / "hulls.npz", **hulls)  # type: ignore[arg-type]
 
 
-def _check_order(links: list[str | None], child_of: list[str | None]) -> None:
-    """PyBullet numbers links in the order of its own depth-first walk; here that is the file's order of joints."""
-    assert len(links) == len(child_of) + 1
+def _moved(points: np.ndarray, origin: ElementTree.Element | None) -> np.ndarray:
+    """Points of a mesh in its link's frame, by the URDF's origin element."""
+    if origin is None:
+        return points
+    shift, turn = ([float(word) for word in origin.get(key, "0 0 0").split()] for key in ("xyz", "rpy"))
+    return Rotation.from_euler("xyz", turn).apply(points) + shift
 
 
-def _write_without(tree: ElementTree.ElementTree, kind: str, path: Path) -> None:
-    for link in tree.getroot().findall("link"):  # type: ignore[union-attr]
-        for part in link.findall(kind):
-            link.remove(part)
-    tree.write(path)
-
-
-def _redraw(source: Path, target: Path) -> np.ndarray:
-    """Write a copy with few faces, its colours baked into a picture; returns its bounding box's corners (8, 3)."""
+def _redraw(source: Path, target: Path, faces: int) -> np.ndarray:
+    """Write a copy with few faces, its colours baked into a picture; returns its vertices (N, 3)."""
     original = trimesh.load(source)
-    parts = list(original.geometry.values()) if isinstance(original, trimesh.Scene) else [original]
+    geometries = original.geometry.values() if isinstance(original, trimesh.Scene) else [original]
+    parts = [part for part in geometries if isinstance(part, trimesh.Trimesh)]
     merged = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
-    if len(merged.faces) <= FACES[target.stem]:
-        vertices, triangles = meshes.decimate(merged, len(merged.faces))
+    if len(merged.faces) <= faces:
+        vertices, triangles = meshes.decimate(merged, faces)
         normals = meshes.corner_normals(vertices, triangles)
     else:
         smooth = surfaces.outer_surface(merged)
-        vertices, triangles = meshes.decimate(smooth, FACES[target.stem])
+        vertices, triangles = meshes.decimate(smooth, faces)
         normals = surfaces.transferred_normals(vertices, triangles, smooth)
     points, colours = _coloured_points(parts)
     picture, uv = surfaces.bake(vertices, triangles, points, colours, CELL_PX)
     Image.fromarray(picture).save(target.with_suffix(".png"))
     meshes.write_obj(target, vertices, triangles, normals, uv, f"{target.stem}.png")
-    return meshes.box_corners(vertices)
+    return vertices
 
 
 def _coloured_points(parts: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarray]:
@@ -166,7 +180,7 @@ def _face_colours(part: trimesh.Trimesh) -> np.ndarray:
     return picture[rows, columns]
 
 
-def joint_path(bullet: Any, arm: int, points: np.ndarray, yaw_rad: float) -> tuple[np.ndarray, float]:
+def joint_path(bullet: Client, arm: int, points: np.ndarray, yaw_rad: float) -> tuple[np.ndarray, float]:
     """Joint angles (N, 7) that bring the point between the fingertips to each of `points` (N, 3), gripper down.
 
     The arm is left in the first configuration.
@@ -175,33 +189,31 @@ def joint_path(bullet: Any, arm: int, points: np.ndarray, yaw_rad: float) -> tup
         The angles, and the largest distance in metres between a point and where the arm really gets.
     """
     down = bullet.call("getQuaternionFromEuler", (np.pi, 0.0, yaw_rad))
+    bounds = {
+        "lowerLimits": LOWER_RAD,
+        "upperLimits": UPPER_RAD,
+        "jointRanges": np.subtract(UPPER_RAD, LOWER_RAD).tolist(),
+        "restPoses": REST_RAD,
+        "maxNumIterations": 40,
+        "residualThreshold": 1e-6,
+    }
     reset(bullet, arm, np.array(REST_RAD))
-    angles, error = [], 0.0
-    spans = np.subtract(UPPER_RAD, LOWER_RAD).tolist()
-    for number, point in enumerate(points):
-        for _ in range(20 if number == 0 else 3):
-            solution = bullet.call(
-                "calculateInverseKinematics",
-                arm,
-                GRASP_LINK,
-                point.tolist(),
-                down,
-                lowerLimits=list(LOWER_RAD),
-                upperLimits=list(UPPER_RAD),
-                jointRanges=spans,
-                restPoses=list(REST_RAD),
-                maxNumIterations=40,
-                residualThreshold=1e-6,
-            )
-            reset(bullet, arm, np.array(solution[:7]))
-        reached = bullet.call("getLinkState", arm, GRASP_LINK, computeForwardKinematics=True)[4]
-        error = max(error, float(np.linalg.norm(np.subtract(reached, point))))
-        angles.append(solution[:7])
+    angles, worst = [], 0.0
+    for point in points.tolist():
+        for _ in range(IK_CALLS):
+            solution = bullet.call("calculateInverseKinematics", arm, GRASP_LINK, point, down, **bounds)[:7]
+            reset(bullet, arm, np.array(solution))
+            reached = bullet.call("getLinkState", arm, GRASP_LINK, computeForwardKinematics=True)[4]
+            error = float(np.linalg.norm(np.subtract(reached, point)))
+            if error < IK_ERROR_M:
+                break
+        worst = max(worst, error)
+        angles.append(solution)
     reset(bullet, arm, np.array(angles[0]))
-    return np.array(angles), error
+    return np.array(angles), worst
 
 
-def reset(bullet: Any, arm: int, angles: np.ndarray) -> None:
+def reset(bullet: Client, arm: int, angles: np.ndarray) -> None:
     """Put the arm at rest in joint angles (7,), fingers closed."""
     for joint, angle in zip(JOINTS, [*angles.tolist(), 0.0, 0.0], strict=True):
         bullet.call("resetJointState", arm, joint, angle, 0.0)

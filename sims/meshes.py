@@ -37,12 +37,6 @@ def _rotation2(angle: float) -> np.ndarray:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def box_corners(points: np.ndarray) -> np.ndarray:
-    """(8, 3) corners of the bounding box of a cloud (N, 3)."""
-    low, high = points.min(axis=0), points.max(axis=0)
-    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-
-
 def decimate(mesh: trimesh.Trimesh, faces: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (V, 3) and triangles (F, 3) of a copy with about `faces` triangles (quadric edge collapse)."""
     welded = trimesh.Trimesh(np.asarray(mesh.vertices), np.asarray(mesh.faces), process=False)

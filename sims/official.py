@@ -85,22 +85,38 @@ def _head(path: Path, characters: int = 2000) -> str:
 
 
 def load(model: TexturedModel) -> trimesh.Trimesh:
-    """The mesh with its texture coordinates."""
-    mesh = trimesh.load(model.mesh, force="mesh", process=False)
-    if getattr(mesh.visual, "uv", None) is None:
+    """The mesh with its texture coordinates.
+
+    Raises:
+        SimError: the file's texture coordinates do not belong to its faces.
+    """
+    mesh = trimesh.load_mesh(model.mesh, process=False)
+    if isinstance(mesh, trimesh.Scene):
+        mesh = mesh.to_mesh()
+    if not isinstance(mesh, trimesh.Trimesh) or not hasattr(mesh.visual, "uv") or mesh.visual.uv is None:
         raise SimError(f"{model.mesh} has texture coordinates that do not belong to its faces: export it again.")
     return mesh
 
 
-def coloured_points(mesh: trimesh.Trimesh, picture: Path, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points spread evenly over a textured mesh (N, 3) and their colours (N, 3) uint8."""
-    image = Image.open(picture).convert("RGB")
+def texture_coordinates(mesh: trimesh.Trimesh) -> np.ndarray:
+    """(V, 2) of a mesh from `load`, v upwards."""
+    return np.asarray(mesh.visual.uv)  # type: ignore[union-attr]
+
+
+def picture_of(model: TexturedModel) -> Image.Image:
+    """The picture, at most `PICTURE_PX` wide and high."""
+    image = Image.open(model.picture).convert("RGB")
     if max(image.size) > PICTURE_PX:
         image = image.resize((PICTURE_PX, PICTURE_PX), Image.Resampling.BOX)
-    pixels = np.asarray(image)
+    return image
+
+
+def coloured_points(mesh: trimesh.Trimesh, model: TexturedModel, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points spread evenly over a textured mesh (N, 3) and their colours (N, 3) uint8."""
+    pixels = np.asarray(picture_of(model))
     points, face = trimesh.sample.sample_surface(mesh, count, seed=0)
     weights = trimesh.triangles.points_to_barycentric(mesh.triangles[face], points)
-    uv = (mesh.visual.uv[mesh.faces[face]] * weights[..., None]).sum(axis=1) % 1.0
+    uv = (texture_coordinates(mesh)[mesh.faces[face]] * weights[..., None]).sum(axis=1) % 1.0
     row = np.clip(((1 - uv[:, 1]) * pixels.shape[0]).astype(int), 0, pixels.shape[0] - 1)
     column = np.clip((uv[:, 0] * pixels.shape[1]).astype(int), 0, pixels.shape[1] - 1)
     return np.asarray(points), pixels[row, column]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import hypot
+
 import numpy as np
 
 from sims import arm as panda
@@ -10,6 +12,9 @@ from sims.background import TABLE_HIGH_M, TABLE_LOW_M, TABLE_THICKNESS_M
 from sims.bullet import Client
 
 STEPS_PER_S = 240
+TOUCH_M = 0.0005
+"""Bodies this near to each other touch: contacts are found a little before surfaces meet."""
+POSITION_GAINS, VELOCITY_GAINS = (0.3,) * 9, (1.0,) * 9
 
 
 class World:
@@ -30,7 +35,7 @@ class World:
         bullet.call(
             "setPhysicsEngineParameter",
             fixedTimeStep=1 / STEPS_PER_S,
-            numSolverIterations=50,
+            numSolverIterations=30,
             deterministicOverlappingPairs=1,
         )
         low, high = np.array(TABLE_LOW_M), np.array(TABLE_HIGH_M)
@@ -67,18 +72,18 @@ class World:
             self.bullet.call("changeDynamics", self.arm, joint, lateralFriction=0.5, restitution=0.0)
         return int(self.arm)
 
-    def drive(self, angles: np.ndarray, speeds: np.ndarray) -> None:
-        """Set the position motors' targets: joint angles (7,) and speeds (7,); the fingers stay closed."""
+    def drive(self, positions: list[float], speeds: list[float]) -> None:
+        """Set the motors' targets: (9,) joint angles and finger positions, and their speeds."""
         self.bullet.call(
             "setJointMotorControlArray",
             self.arm,
             panda.JOINTS,
             self.bullet.module.POSITION_CONTROL,
-            targetPositions=[*angles.tolist(), 0.0, 0.0],
-            targetVelocities=[*speeds.tolist(), 0.0, 0.0],
+            targetPositions=positions,
+            targetVelocities=speeds,
             forces=panda.FORCE_N,
-            positionGains=[0.3] * 9,
-            velocityGains=[1.0] * 9,
+            positionGains=POSITION_GAINS,
+            velocityGains=VELOCITY_GAINS,
         )
 
     def step(self) -> None:
@@ -90,13 +95,10 @@ class World:
         states = [self.bullet.call("getBasePositionAndOrientation", body) for body in self.objects]
         return np.array([[*position, *quaternion] for position, quaternion in states])
 
-    def speeds(self) -> tuple[np.ndarray, np.ndarray]:
-        """(O,) metres per second and (O,) radians per second of every object."""
+    def fastest(self) -> tuple[float, float]:
+        """Largest speed in metres per second and largest turning speed in radians per second of all objects."""
         states = [self.bullet.call("getBaseVelocity", body) for body in self.objects]
-        return (
-            np.array([np.linalg.norm(linear) for linear, _ in states]),
-            np.array([np.linalg.norm(angular) for _, angular in states]),
-        )
+        return max(hypot(*linear) for linear, _ in states), max(hypot(*angular) for _, angular in states)
 
     def joints(self) -> np.ndarray:
         """(9,) joint angles in radians, finger positions in metres."""
@@ -112,19 +114,15 @@ class World:
         points = self.bullet.call("getClosestPoints", self.arm, body, reach_m)
         return min((point[8] for point in points), default=np.inf)
 
-    def contacts(self) -> tuple[np.ndarray, np.ndarray]:
-        """Who touches whom now: arm-object (O,) and object-object (O, O) flags."""
-        count = len(self.objects)
-        slot = {body: i for i, body in enumerate(self.objects)}
-        arm_contact = np.zeros(count, dtype=bool)
-        object_contact = np.zeros((count, count), dtype=bool)
-        for i, body in enumerate(self.objects):
-            for point in self.bullet.call("getContactPoints", body):
-                if point[8] > 0.0005:
-                    continue
-                other = point[2] if point[1] == body else point[1]
-                if other == self.arm:
-                    arm_contact[i] = True
-                elif other in slot:
-                    object_contact[i, slot[other]] = object_contact[slot[other], i] = True
-        return arm_contact, object_contact
+    def contacts(self) -> tuple[list[int], list[tuple[int, int]]]:
+        """Who touches whom now: numbers of the objects that the arm touches, and pairs of touching objects."""
+        call, objects = self.bullet.call, self.objects
+        number = {body: i for i, body in enumerate(objects)}
+        with_arm = {point[2] for point in call("getContactPoints", self.arm) if point[8] <= TOUCH_M}
+        pairs = []
+        for i, body in enumerate(objects):
+            for j in range(i + 1, len(objects)):
+                points = call("getContactPoints", body, objects[j])
+                if any(point[8] <= TOUCH_M for point in points):
+                    pairs.append((i, j))
+        return sorted(number[body] for body in with_arm if body in number), pairs

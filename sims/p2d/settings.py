@@ -43,9 +43,9 @@ class Settings(BaseModel):
     """Where objects are put and lines run, metres in front of the robot's base."""
     workspace_y: Span = (-0.14, 0.14)
     """Likewise to its left."""
-    height_m: float = Field(default=0.025, gt=0, le=0.2)
-    """Of the fingertips above the table."""
-    speed_m_s: float = Field(default=0.12, gt=0, le=0.5)
+    height_m: float = Field(default=0.012, ge=0.01, le=0.2)
+    """Of the point between the fingertips, which end 7 mm lower, above the table."""
+    speed_m_s: float = Field(default=0.15, gt=0, le=0.5)
     """Of the gripper along its line."""
     max_redraws: int = Field(default=100, ge=0)
     """Attempts at one trajectory before giving up with an error."""

@@ -10,25 +10,26 @@ import numpy as np
 
 from sims import arm as panda
 from sims.assets import ObjectModel, object_models
+from sims.background import TABLE_HIGH_M, TABLE_LOW_M
 from sims.errors import SimError
 from sims.p2d.settings import Settings
 from sims.p2d.spec import Spec, sample
 from sims.p2d.trajectory import Trajectory
-from sims.background import TABLE_HIGH_M, TABLE_LOW_M
-from sims.render import Renderer, rotation
+from sims.poses import moved
+from sims.render import Renderer
 from sims.world import STEPS_PER_S, World
 
 SETTLE_S = 1.5
 REST_M_S, REST_RAD_S = 0.005, 0.05
 REST_STEPS = 24
 RAMP_S = 0.25
-WAYPOINT_M = 0.02
-IK_ERROR_M = 0.003
+WAYPOINT_M = 0.03
+REACH_ERROR_M = 0.001
 START_GAP_M = 0.01
 IN_PICTURE = 0.9
 """Least share of an object's vertices within the picture's border, in every frame."""
-RESOLUTION_DIGITS = 5
-"""Poses are kept to 10 micrometres, so that what rests has the same pose in every frame."""
+STILL_M, STILL_RAD = 1e-4, 1e-3
+"""An object that moved less than this since its last recorded pose keeps that pose: what rests is exactly at rest."""
 
 
 class Unusable(Exception):
@@ -120,8 +121,8 @@ def _settle(world: World) -> None:
     calm = 0
     for _ in range(int(SETTLE_S * STEPS_PER_S)):
         world.step()
-        linear, angular = world.speeds()
-        calm = calm + 1 if linear.max() < REST_M_S and angular.max() < REST_RAD_S else 0
+        linear, angular = world.fastest()
+        calm = calm + 1 if linear < REST_M_S and angular < REST_RAD_S else 0
         if calm >= REST_STEPS:
             return
     raise Unusable("the objects did not come to rest")
@@ -133,9 +134,19 @@ def _path(world: World, spec: Spec) -> np.ndarray:
     count = max(2, int(np.ceil(np.linalg.norm(end - start) / WAYPOINT_M)) + 1)
     points = start + np.linspace(0, 1, count)[:, None] * (end - start)
     angles, error = panda.joint_path(world.bullet, world.arm, points, spec.yaw_rad)
-    if error > IK_ERROR_M:
+    if error > REACH_ERROR_M:
         raise Unusable("the arm does not reach the whole line")
     return angles
+
+
+def duration_s(settings: Settings, spec: Spec) -> float:
+    """How long the push takes."""
+    return float(np.linalg.norm(np.subtract(spec.end, spec.start))) / settings.speed_m_s + RAMP_S
+
+
+def steps_of(settings: Settings, spec: Spec) -> int:
+    """Physics steps of the push."""
+    return int(np.ceil(duration_s(settings, spec) * STEPS_PER_S))
 
 
 def progress(time_s: np.ndarray, duration_s: float) -> np.ndarray:
@@ -151,12 +162,15 @@ def progress(time_s: np.ndarray, duration_s: float) -> np.ndarray:
 
 
 def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[ObjectModel, ...], spec: Spec) -> Episode:
-    length = float(np.linalg.norm(np.subtract(spec.end, spec.start)))
-    duration = length / settings.speed_m_s + RAMP_S
-    steps = int(np.ceil(duration * STEPS_PER_S))
+    duration = duration_s(settings, spec)
+    steps = steps_of(settings, spec)
     share = progress(np.arange(steps + 2) / STEPS_PER_S, duration)
     knots = np.linspace(0, 1, len(path))
     angles = np.stack([np.interp(share, knots, path[:, joint]) for joint in range(7)], axis=1)
+    fingers = np.zeros((len(angles), 2))
+    positions = np.concatenate([angles, fingers], axis=1)
+    speeds = (np.diff(positions, axis=0) * STEPS_PER_S).tolist()
+    positions = positions.tolist()
     stops = np.round(np.linspace(0, steps, settings.frames)).astype(int)
     used = [models[placement.class_index] for placement in spec.objects]
     count = len(used)
@@ -165,24 +179,34 @@ def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[Ob
     step = 0
     for stop in stops:
         while step < stop:
-            world.drive(angles[step + 1], (angles[step + 1] - angles[step]) * STEPS_PER_S)
+            world.drive(positions[step + 1], speeds[step])
             world.step()
             touched, met = world.contacts()
-            arm_contact |= touched
-            object_contact |= met
+            arm_contact[touched] = True
+            for one, other in met:
+                object_contact[one, other] = object_contact[other, one] = True
             step += 1
-        poses = world.poses()
+        poses = _steady(world.poses(), frames[-1][0] if frames else None)
         _check(settings, poses, used)
         frames.append((poses, world.joints(), world.gripper(), arm_contact.copy(), object_contact.copy()))
         arm_contact[:], object_contact[:] = False, False
     poses, joints, gripper, arm, other = (np.stack(column) for column in zip(*frames, strict=True))
-    poses = np.round(poses, RESOLUTION_DIGITS)
     return Episode(poses.astype(np.float32), joints.astype(np.float32), gripper.astype(np.float32), arm, other)
+
+
+def _steady(poses: np.ndarray, before: np.ndarray | None) -> np.ndarray:
+    """Poses (O, 7), with the pose before where an object has not really moved."""
+    if before is None:
+        return poses
+    shift = np.linalg.norm(poses[:, :3] - before[:, :3], axis=1)
+    cosine = np.abs((poses[:, 3:] * before[:, 3:]).sum(axis=1))
+    still = (shift < STILL_M) & (2 * np.arccos(np.minimum(cosine, 1)) < STILL_RAD)
+    return np.where(still[:, None], before, poses)
 
 
 def _check(settings: Settings, poses: np.ndarray, models: list[ObjectModel]) -> None:
     for model, pose in zip(models, poses, strict=True):
-        points = model.vertices @ rotation(pose[3:]).T + pose[:3]
+        points = moved(model.vertices, pose)
         if points[:, 2].max() < 0 or (pose[:2] < TABLE_LOW_M).any() or (pose[:2] > TABLE_HIGH_M).any():
             raise Unusable("an object left the table")
         pixels, _ = settings.camera.project(points, settings.image_size)
@@ -196,10 +220,9 @@ def _label(settings: Settings, spec: Spec, episode: Episode, models: tuple[Objec
     renderer = _renderer(os.getpid(), settings)
     renderer.show(tuple(models[placement.class_index] for placement in spec.objects))
     used, slots = len(spec.objects), settings.max_objects
-    pictures, amodal = [], []
+    pictures = []
     for joints, poses in zip(episode.joints, episode.poses, strict=True):
         pictures.append(renderer.picture(joints, poses))
-        amodal.append(renderer.amodal_px(joints, poses, pictures[-1]))
     segmentation = np.stack([picture.segmentation for picture in pictures])
     visible = np.stack([(segmentation == 1 + part).sum(axis=(1, 2)) for part in range(slots + 1)], axis=1)
     padded = slots - used
@@ -212,7 +235,7 @@ def _label(settings: Settings, spec: Spec, episode: Episode, models: tuple[Objec
         joints=episode.joints,
         gripper=episode.gripper,
         visible_px=visible.astype(np.int32),
-        amodal_px=np.pad(np.stack(amodal), ((0, 0), (0, padded))).astype(np.int32),
+        amodal_px=np.pad(np.stack([picture.amodal_px for picture in pictures]), ((0, 0), (0, padded))).astype(np.int32),
         arm_contact=np.pad(episode.arm_contact, ((0, 0), (0, padded))),
         object_contact=np.pad(episode.object_contact, ((0, 0), (0, padded), (0, padded))),
         aimed=spec.aimed,

@@ -104,7 +104,9 @@ def sample(settings: Settings, split: str, index: int, attempt: int = 0) -> Spec
 class _Placed:
     placement: Placement
     outline: np.ndarray
-    """(4, 2) rectangle around the object on the table."""
+    """(4, 2) rectangle around the object on the table, metres."""
+    points: np.ndarray
+    """(N, 3) its vertices in the world, metres."""
 
 
 def _place(
@@ -132,15 +134,14 @@ def _put(settings: Settings, model: ObjectModel, class_index: int, rng: np.rando
     orientation = Rotation.from_euler("z", yaw) * Rotation.from_quat(resting)
     lowest = float(Rotation.from_quat(resting).apply(model.touching)[:, 2].min())
     position = np.array([*centre, DROP_M - lowest])
-    pixels, _ = settings.camera.project(orientation.apply(model.vertices) + position, settings.image_size)
-    border = BORDER * settings.image_size
-    if (pixels < border).any() or (pixels > settings.image_size - border).any():
+    points = orientation.apply(model.vertices) + position
+    if not _in_picture(settings, points):
         return None
     footprint = Rotation.from_quat(resting).apply(model.vertices)[:, :2]
     outline = rectangle(centre, np.ptp(footprint, axis=0), yaw)
     quaternion = tuple(float(value) for value in orientation.as_quat())
     place = tuple(float(value) for value in position)
-    return _Placed(Placement(class_index, name, place, quaternion), outline)  # type: ignore[arg-type]
+    return _Placed(Placement(class_index, name, place, quaternion), outline, points)  # type: ignore[arg-type]
 
 
 def _line(
@@ -163,9 +164,33 @@ def _line(
         if (ends < low).any() or (ends > high).any() or np.linalg.norm(end - start) < MIN_LINE_M:
             continue
         hand = rectangle(start, GRIPPER_M, yaw)
-        if all(separate(hand, each.outline, MARGIN_M) for each in objects):
+        clear = all(separate(hand, each.outline, MARGIN_M) for each in objects)
+        if clear and all(_in_picture(settings, _pushed(each, start, end, hand)) for each in objects):
             return (float(start[0]), float(start[1])), (float(end[0]), float(end[1])), yaw
     return None
+
+
+def _in_picture(settings: Settings, points: np.ndarray) -> bool:
+    pixels, _ = settings.camera.project(points, settings.image_size)
+    border = BORDER * settings.image_size
+    return bool((pixels >= border).all() and (pixels <= settings.image_size - border).all())
+
+
+def _pushed(each: _Placed, start: np.ndarray, end: np.ndarray, hand: np.ndarray) -> np.ndarray:
+    """About where an object's vertices end when the hand, with corners `hand` (4, 2) at `start`, moves to `end`.
+
+    It slides before the hand without turning; simulating it afterwards finds out whether it really stays in the picture,
+    but lines that would surely push it out are dropped here at no cost.
+    """
+    length = float(np.linalg.norm(end - start))
+    along = (end - start) / length
+    across = np.array([-along[1], along[0]])
+    hand, outline = hand - start, each.outline - start
+    apart = max((hand @ across).min() - (outline @ across).max(), (outline @ across).min() - (hand @ across).max())
+    shift = length + (hand @ along).max() - (outline @ along).min()
+    if apart > 0 or shift < 0 or (outline @ along).max() < (hand @ along).min():
+        return each.points
+    return each.points + np.array([*(shift * along), 0.0])
 
 
 def rectangle(centre: np.ndarray, sides: tuple[float, float] | np.ndarray, yaw: float) -> np.ndarray:

@@ -1,0 +1,138 @@
+"""A server that only draws: posed bodies, no physics, so that a picture depends on poses alone."""
+
+from __future__ import annotations
+
+import importlib.util
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from sims import arm as panda
+from sims.assets import ObjectModel
+from sims.bullet import Client
+from sims.camera import Camera
+from sims.errors import SimError
+
+Backend = Literal["tiny", "egl"]
+
+ARM_ID, FIRST_OBJECT_ID = 1, 2
+HIDDEN_POSE = np.array([0.0, 0.0, -50.0, 0.0, 0.0, 0.0, 1.0])
+
+LIGHT_DIRECTION = (0.35, -0.5, 1.0)
+AMBIENT, DIFFUSE, SPECULAR = 0.58, 0.52, 0.04
+
+
+class Stage:
+    """Arm and objects over nothing, seen by any camera.
+
+    Args:
+        backend: 'tiny' draws on the CPU; 'egl' needs a machine with EGL, which GPU drivers bring.
+        arm: the arm's model; None for a stage without it.
+
+    Raises:
+        SimError: the EGL renderer cannot be loaded.
+    """
+
+    def __init__(self, backend: Backend, arm: panda.ArmModel | None) -> None:
+        self.backend = backend
+        self.bullet = Client()
+        module = self.bullet.module
+        if backend == "egl":
+            self._plugin = load_egl(self.bullet)
+        self._renderer = module.ER_BULLET_HARDWARE_OPENGL if backend == "egl" else module.ER_TINY_RENDERER
+        self.bodies: list[int] = []
+        self.arm = -1
+        if arm is not None:
+            # A graphics card draws the arm as it comes; the few faces are for the processor.
+            urdf = str(arm.original if backend == "egl" else arm.visual)
+            self.arm = int(self.bullet.call("loadURDF", urdf, [0, 0, 0], useFixedBase=True))
+            self._arm_base = self.bullet.call("getBasePositionAndOrientation", self.arm)
+        if backend == "egl":
+            # The very first picture takes some of its light from defaults; none of ours may be the first.
+            self.draw(Camera(), 16)
+
+    def show(self, models: tuple[ObjectModel, ...]) -> None:
+        """Put these objects on the stage instead of those before, out of sight until they are posed."""
+        for body in self.bodies:
+            self.bullet.call("removeBody", body)
+        mesh = self.bullet.module.GEOM_MESH
+        self.bodies = []
+        for model in models:
+            shape = self.bullet.call(
+                "createVisualShape", mesh, fileName=str(model.detailed if self.backend == "egl" else model.visual)
+            )
+            body = self.bullet.call("createMultiBody", 0.0, -1, shape, HIDDEN_POSE[:3].tolist())
+            self.bodies.append(int(body))
+
+    def pose(self, body: int, pose: np.ndarray) -> None:
+        """Move a body to x, y, z in metres and quaternion x, y, z, w."""
+        self.bullet.call("resetBasePositionAndOrientation", body, pose[:3].tolist(), pose[3:].tolist())
+
+    def show_arm(self, visible: bool) -> None:
+        """Put the arm's base in its place, or out of sight; no matter on a stage without it."""
+        if self.arm >= 0:
+            position, quaternion = self._arm_base if visible else (HIDDEN_POSE[:3].tolist(), (0, 0, 0, 1))
+            self.bullet.call("resetBasePositionAndOrientation", self.arm, position, quaternion)
+
+    def pose_joints(self, joints: np.ndarray) -> None:
+        """Bend the arm: (9,) joint angles in radians and finger positions in metres."""
+        for joint, value in zip(panda.JOINTS, joints.tolist(), strict=True):
+            self.bullet.call("resetJointState", self.arm, joint, value)
+
+    def draw(self, camera: Camera, size_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Colour (H, W, 3) uint8, depth (H, W) float64 in metres, ids (H, W) uint8: 0 nothing, 1 arm, 2 + i object i.
+
+        Where there is nothing depth is infinite.
+        """
+        view, projection = _matrices(camera)
+        _, _, rgba, buffer, bodies = self.bullet.call(
+            "getCameraImage",
+            size_px,
+            size_px,
+            view,
+            projection,
+            lightDirection=LIGHT_DIRECTION,
+            lightColor=(1, 1, 1),
+            lightAmbientCoeff=AMBIENT,
+            lightDiffuseCoeff=DIFFUSE,
+            lightSpecularCoeff=SPECULAR,
+            shadow=0,
+            renderer=self._renderer,
+        )
+        # Body numbers become ids by one look-up: -1 (nothing) is the table's last entry.
+        known = [self.arm, *self.bodies]
+        table = np.zeros(max(known) + 2, dtype=np.uint8)
+        table[known] = np.arange(ARM_ID, ARM_ID + len(known))
+        table[-1] = 0
+        ids = table[np.reshape(bodies, (size_px, size_px))]
+        seen = ids > 0
+        depth = np.full(ids.shape, np.inf)
+        depth[seen] = camera.metres(np.reshape(buffer, ids.shape)[seen].astype(np.float64))
+        return np.reshape(rgba, (size_px, size_px, 4))[..., :3], depth, ids
+
+    def close(self) -> None:
+        """Free the server."""
+        self.bullet.close()
+
+
+def load_egl(bullet: Client) -> int:
+    """Load PyBullet's EGL renderer into a server.
+
+    Raises:
+        SimError: it is not part of this PyBullet, or finds no EGL.
+    """
+    spec = importlib.util.find_spec("eglRenderer")
+    if spec is None or spec.origin is None:
+        raise SimError("renderer 'egl' is not part of this PyBullet (its wheels for Linux have it): use renderer=tiny.")
+    plugin = int(bullet.call("loadPlugin", spec.origin, "_eglRendererPlugin"))
+    if plugin < 0:
+        raise SimError(
+            "renderer 'egl' found no EGL display: use renderer=tiny, or a machine with a GPU and its driver."
+        )
+    return plugin
+
+
+@lru_cache(maxsize=8)
+def _matrices(camera: Camera) -> tuple[list[float], list[float]]:
+    return camera.view_matrix(), camera.projection_matrix()
