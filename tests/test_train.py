@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -335,3 +336,14 @@ def test_a_model_that_does_not_train_is_evaluated(command: Callable[..., Ended],
     assert record(the_run())["status"] == "finished"
     assert (the_run() / "checkpoints" / "last.ckpt").is_file()
     assert not (the_run() / "curves.csv").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler")
+def test_a_compiled_run_has_the_same_checkpoint_layout(train: Callable[..., Ended], tmp_path: Path) -> None:
+    # the numbers differ: compiled code draws its noise from a generator of its own
+    assert train("trainer.compile=true", f"paths.outputs={tmp_path / 'compiled'}").code == 0
+    assert train().code == 0
+    plain, compiled = (weights(next(tmp_path.glob(f"{name}/*/seed_0"))) for name in ("outputs", "compiled"))
+    assert plain.keys() == compiled.keys()
+    assert all(value.isfinite().all() for value in compiled.values())

@@ -1,0 +1,42 @@
+# `make quickstart`: from a fresh clone to a picture. Needs python3.11 (or newer, with data that are there) and make.
+# Runs in the active virtual environment, else in .venv, which it makes.
+
+ifdef VIRTUAL_ENV
+VENV := $(VIRTUAL_ENV)
+else
+VENV := .venv
+endif
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.apex_lab_installed
+BASE_PYTHON ?= $(shell command -v python3.11 || command -v python3)
+
+.PHONY: quickstart install test test-all lint types contracts
+
+quickstart: install
+	$(BIN)/python -m apex_lab.train scale=quickstart
+
+install: $(INSTALLED)
+
+$(BIN)/python:
+	$(BASE_PYTHON) -m venv $(VENV)
+
+$(INSTALLED): pyproject.toml | $(BIN)/python
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	touch $@
+
+test: install
+	$(BIN)/python -m pytest -m "not slow and not gpu" -n auto
+
+test-all: install
+	$(BIN)/python -m pytest -n auto
+
+lint: install
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+types: install
+	$(BIN)/mypy
+
+contracts: install
+	$(BIN)/lint-imports
