@@ -148,16 +148,17 @@ class Run:
         for part in self.folder.rglob(".*.part"):
             part.unlink()  # left by a kill in the middle of writing
         commit, dirty = provenance.commit()
-        started = self.record.get("started", _now())
-        choices, config = self.job.choices, self.job.config
+        now, choices, config = _now(), self.job.choices, self.job.config
+        history = [*self.record.get("history", []), {"started": now, "command": command, "commit": commit}]
         self.record = {
             **self.record,
             "status": "running",
             "reason": None,
-            "started": started,
+            "started": history[0]["started"],
             "finished": None,
             "seconds": self.record.get("seconds", 0.0),  # of training, over all restarts
             "steps": self.record.get("steps", 0),
+            "history": history,
             "command": command,
             "overrides": list(self.job.overrides),
             **{group: choices.get(group) for group in ("model", "ablation", "data", "scale", "experiment")},

@@ -6,6 +6,7 @@ python -m apex_lab.train +ablation=no_entropy seed=0,1,2,3 scale=cpu -m
 
 from __future__ import annotations
 
+import copy
 import time
 import traceback
 from typing import Any
@@ -273,14 +274,13 @@ def estimate(config: Config, model: SceneModel) -> float:
     frames, side = min(2, int(config.data["frames"])), int(config.data["image_size"])
     schedule = schedule_at({name: value(0) for name, value in build_schedules(config).items()})
     weights = build_weights(config)
+    model = copy.deepcopy(model).train()
     with torch.random.fork_rng(devices=[]):
         video = torch.rand(1, frames, 3, side, side)
-        model.train()
         began = time.perf_counter()
         terms = model(video, schedule).terms
         torch.stack([terms[name].sum() * weight(0) for name, weight in weights.items()]).sum().backward()
         seconds = time.perf_counter() - began
-    model.zero_grad(set_to_none=True)
     return seconds / frames * int(config.data["frames"]) * int(config.data["batch_size"]) * config.trainer.max_steps
 
 
