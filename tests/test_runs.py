@@ -64,7 +64,7 @@ def test_a_record_goes_from_running_to_its_end(job: Job) -> None:
         run.start("python -m apex_lab.train", torch.device("cpu"))
         assert (run.record["status"], run.record["reason"]) == ("running", None)
         assert (run.record["started"], run.record["steps"], run.record["seconds"]) == (started, 4, 2.5)
-        assert [start["started"] for start in run.record["history"]][0] == started
+        assert run.record["history"][0]["started"] == started
         assert len(run.record["history"]) == 2
         run.finish()
         assert not run.finished  # no results yet

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, Tim
 from rich.progress import Progress as Bar
 
 from apex_lab import checkpoints, console
+from apex_lab.estimate import readable
 from apex_lab.interrupts import Deferred
 from apex_lab.learner import Learner
 from apex_lab.runs import Run
@@ -159,11 +160,3 @@ class Progress(L.Callback):
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
-
-
-def readable(seconds: float) -> str:
-    """A duration in the unit a person would use."""
-    for size, unit in ((86400.0, "days"), (3600.0, "hours"), (60.0, "minutes")):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.1f} {unit}" if seconds < 10 * size else f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} seconds"

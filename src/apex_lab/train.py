@@ -6,8 +6,6 @@ python -m apex_lab.train +ablation=no_entropy seed=0,1,2,3 scale=cpu -m
 
 from __future__ import annotations
 
-import copy
-import time
 import traceback
 from typing import Any
 
@@ -15,9 +13,8 @@ import lightning as L
 import torch
 from lightning.pytorch.loggers import Logger
 
-from apex_lab import callbacks, checkpoints, cli, components, console, evaluation
+from apex_lab import callbacks, checkpoints, cli, components, console, estimate, evaluation
 from apex_lab.config import (
-    Config,
     Job,
     build_model,
     build_optimizer,
@@ -81,8 +78,10 @@ def _train(run: Run, device: torch.device) -> None:
     checkpoint = _checkpoint(run)
     console.say(f"{title(run.job)} on {device.type}: {run.folder}")
     model = build_model(config)
-    if model.needs_training and checkpoint is None:
-        _say_duration(config, model, device)
+    if model.needs_training and checkpoint is None and device.type == "cpu":
+        told = estimate.warning(config, model)
+        if told is not None:
+            console.warn(told)
     data = components.build(config.data, "data")
     data.prepare_data()
     data.setup("fit")
@@ -251,37 +250,6 @@ def _callbacks(run: Run, training: dict[str, Any] | None, deferred: Deferred) ->
         training,
     )
     return [keep, *(components.build(node, f"callbacks.{name}") for name, node in config.callbacks.items())]
-
-
-LONG = 3 * 3600.0
-"""Seconds of training on a CPU above which a person is told before it starts."""
-
-
-def _say_duration(config: Config, model: SceneModel, device: torch.device) -> None:
-    """On a CPU, says how long training will take if that is long, measured on one short step."""
-    if device.type != "cpu":
-        return
-    seconds = estimate(config, model)
-    if seconds > LONG:
-        console.warn(
-            f"Training will take about {callbacks.readable(seconds)} on this CPU (estimated from one short step); "
-            "scale=cpu is made for CPUs: python -m apex_lab.train scale=cpu"
-        )
-
-
-def estimate(config: Config, model: SceneModel) -> float:
-    """Seconds that training takes on the CPU, from one step on one video of two frames, scaled up."""
-    frames, side = min(2, int(config.data["frames"])), int(config.data["image_size"])
-    schedule = schedule_at({name: value(0) for name, value in build_schedules(config).items()})
-    weights = build_weights(config)
-    model = copy.deepcopy(model).train()
-    with torch.random.fork_rng(devices=[]):
-        video = torch.rand(1, frames, 3, side, side)
-        began = time.perf_counter()
-        terms = model(video, schedule).terms
-        torch.stack([terms[name].sum() * weight(0) for name, weight in weights.items()]).sum().backward()
-        seconds = time.perf_counter() - began
-    return seconds / frames * int(config.data["frames"]) * int(config.data["batch_size"]) * config.trainer.max_steps
 
 
 if __name__ == "__main__":
