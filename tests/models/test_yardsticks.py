@@ -52,7 +52,7 @@ def subtraction(radius: int = 0) -> BackgroundSubtraction:
 
 
 def learners() -> Iterator[SceneModel]:
-    yield ColorClusters()
+    yield ColorClusters(colors=4)
     yield ColorClusters(colors=8)  # more clusters than colours
     yield subtraction()
 
@@ -113,6 +113,16 @@ def test_a_video_does_not_depend_on_its_batch(model: SceneModel) -> None:
         assert torch.equal(alone.masks[0], whole.masks[b])
         assert torch.equal(alone.ids[0], whole.ids[b])
         torch.testing.assert_close(alone.reconstruction[0], whole.reconstruction[b])
+
+
+@pytest.mark.parametrize("model", list(all_yardsticks()), ids=lambda m: type(m).__name__)
+def test_half_precision_changes_nothing(model: SceneModel) -> None:
+    video, labels = batch(1)
+    whole = run(model, video, labels)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = run(model, video, labels)
+    for name in ("masks", "ids", "appearance", "reconstruction"):
+        assert torch.equal(getattr(half, name), getattr(whole, name)), name
 
 
 @pytest.mark.parametrize("objects", [1, 2, 3])
@@ -179,10 +189,42 @@ def test_background_subtraction_refuses_other_sizes() -> None:
 def test_background_subtraction_finds_what_differs_by_more_than_the_threshold() -> None:
     video, labels = batch(1, objects=2)
     close = TABLE[:, None, None].expand_as(video).clone()
-    close[:, :, :, labels[0, 0] == 1] = TABLE[:, None] + 0.05  # 0.087 in RGB
-    close[:, :, :, labels[0, 0] == 2] = TABLE[:, None] + 0.07  # 0.121
+    close[:, :, :, labels[0, 0] == 1] = TABLE[:, None] + 0.04  # 0.069 in RGB
+    close[:, :, :, labels[0, 0] == 2] = TABLE[:, None] + 0.05  # 0.087
     found = subtraction()(close, {}).segmentation()
     assert torch.equal(found > 0, (labels[:, :1] == 2).expand_as(found))
+
+
+@pytest.mark.parametrize(
+    ("color", "shadow", "found"),
+    [
+        (0.5 * TABLE, 0.4, False),  # a shadow
+        (0.5 * TABLE, 1.0, True),  # ... which is taken for an object if it is not known
+        (0.3 * TABLE, 0.4, True),  # 0.1 of 0.79 too dark for one
+        (1.2 * TABLE, 0.4, True),  # light is no shadow
+        (0.5 * TABLE.flip(0), 0.4, True),  # dark, but of another hue
+    ],
+)
+def test_background_subtraction_knows_shadows(color: Tensor, shadow: float, found: bool) -> None:
+    model = BackgroundSubtraction(SIZE, threshold=0.07, shadow=shadow, radius=0)
+    model.initialise(TABLE[:, None, None].expand(3, SIZE, SIZE))
+    video = TABLE[:, None, None].expand(1, 1, 3, SIZE, SIZE).clone()
+    video[..., 10:20, 10:20] = color[:, None, None]
+    seen = model(video, {}).segmentation()[0, 0] > 0
+    assert seen.sum() == (100 if found else 0)
+
+
+def test_color_clusters_weigh_hue_above_lightness() -> None:
+    video = torch.tensor([0.5, 0.5, 0.5])[:, None, None].expand(1, 1, 3, SIZE, SIZE).clone()
+    video[..., 24:, :] = 0.35  # the lower half in shadow
+    video[..., 10:20, 10:20] = torch.tensor([0.6, 0.45, 0.45])[:, None, None]
+    plain, weighted = (
+        ColorClusters(colors=2, lightness=weight)(video, {}).segmentation()[0, 0] for weight in (1.0, 0.1)
+    )
+    assert plain[40, 5] != plain[5, 5]
+    assert plain[15, 15] == plain[5, 5]
+    assert weighted[40, 5] == weighted[5, 5] == 0
+    assert (weighted > 0).sum() == 100
 
 
 def test_small_regions_are_no_objects() -> None:
@@ -200,7 +242,7 @@ def test_small_regions_are_no_objects() -> None:
 def test_only_the_largest_objects_are_kept() -> None:
     video, labels = batch(1)
     areas = labels[0, 0].flatten().bincount()[1:]
-    for model in (ColorClusters(max_objects=1), BackgroundSubtraction(SIZE, radius=0, max_objects=1)):
+    for model in (ColorClusters(colors=4, max_objects=1), BackgroundSubtraction(SIZE, radius=0, max_objects=1)):
         model.initialise(TABLE[:, None, None].expand(3, SIZE, SIZE))
         scene = model(video, {})
         assert scene.ids.shape[2] == 2

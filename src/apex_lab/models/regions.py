@@ -24,7 +24,8 @@ def one_hot(labels: Int[Tensor, "B T H W"], components: int) -> Bool[Tensor, "B 
 def mean_colors(video: Float[Tensor, "B T 3 H W"], masks: Bool[Tensor, "B T K H W"]) -> Float[Tensor, "B T K 3"]:
     """Mean RGB of the video under each mask; 0 under an empty one."""
     weights = masks.flatten(3).to(video.dtype)
-    return weights @ video.flatten(3).transpose(2, 3) / weights.sum(dim=3, keepdim=True).clamp(min=1)
+    with torch.autocast(video.device.type, enabled=False):  # half precision cannot count pixels
+        return weights @ video.flatten(3).transpose(2, 3) / weights.sum(dim=3, keepdim=True).clamp(min=1)
 
 
 def scene_of_regions(

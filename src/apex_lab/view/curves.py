@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import MaxNLocator
 
 from apex_lab.errors import UserError
 from apex_lab.view.canvas import picture_file
@@ -29,21 +30,24 @@ _SPLIT_COLORS = {"train": "#2d69c3", "val": "#d55e00", "test": "#009e73"}
 _NUMBERED = re.compile(r"^(?P<panel>.*?)[/_](?P<number>\d+)$")
 _REST = ""
 _ORDER = (
-    r"^loss$",
-    r"^ari_fg$",
-    r"^msc_fg$",
-    r"^ari$",
-    r"^msc$",
+    r"(^|/)loss$",
+    r"(^|/)ari_fg$",
+    r"(^|/)msc_fg$",
+    r"(^|/)ari$",
+    r"(^|/)msc$",
     _REST,
-    r"^grad",
+    r"(^|/)grad",
     r"live|count",
     r"window",
     r"share|pixel|foreground",
-    r"prob",
-    r"^temperature|presence$",
-    r"^lr$|learning_rate|second|memory",
+    r"^diagnostics/",
+    r"^schedule/",
+    r"(^|/)lr$|learning_rate|second|memory",
 )
 """Panels in reading order, by what is found in their names; `_REST` is the loss terms and all not named here."""
+
+_SCORE = re.compile(r"^(video_)?(ari|msc|sc)(_fg)?$")
+"""Quantities whose best value is 1; drawn on an axis that ends there."""
 
 
 def curve_page(path: Path, curves_csv: Path) -> None:
@@ -62,7 +66,10 @@ def curve_page(path: Path, curves_csv: Path) -> None:
     Raises:
         UserError: the table is missing, damaged or holds no number, or the picture cannot be written.
     """
-    panels = _panels(_read(curves_csv))
+    table = _read(curves_csv)
+    panels = _panels(table)
+    first, last = float(table.index[0]), float(table.index[-1])
+    steps = (first - 0.03 * (last - first + 1), last + 0.03 * (last - first + 1))
     rows = math.ceil(len(panels) / _COLUMNS)
     # the user's own matplotlib settings must not change the picture
     with matplotlib.style.context("default"):
@@ -73,6 +80,7 @@ def curve_page(path: Path, curves_csv: Path) -> None:
         axes = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
         for ax, (name, lines) in zip(axes, panels.items(), strict=False):
             _draw(ax, name, lines)
+            ax.set_xlim(*steps)
         for ax in axes[len(panels) :]:
             ax.set_axis_off()
         with picture_file(path) as file:
@@ -101,6 +109,7 @@ def _read(curves_csv: Path) -> pd.DataFrame:
 def _panels(table: pd.DataFrame) -> dict[str, list[tuple[str, str, pd.Series]]]:
     """Panel -> its lines as (label, colour, values over step), panels in reading order."""
     panels: dict[str, list[tuple[str, str, pd.Series]]] = {}
+    place: dict[str, int] = {}
     numbers = Counter(_NUMBERED.sub(r"\g<panel>", name) for name in map(str, table) if _NUMBERED.match(name))
     for name in map(str, table):
         head, _, tail = name.partition("/")
@@ -112,11 +121,12 @@ def _panels(table: pd.DataFrame) -> dict[str, list[tuple[str, str, pd.Series]]]:
             quantity, label = match["panel"], f"{split} {match['number']}".strip()
             color = PALETTE[int(match["number"]) % len(PALETTE)]
         panels.setdefault(quantity, []).append((label, color, table[name].dropna()))
-    return {name: panels[name] for name in sorted(panels, key=_place)}
+        place.setdefault(quantity, _place(name))
+    return {name: panels[name] for name in sorted(panels, key=lambda name: place[name])}
 
 
 def _place(name: str) -> int:
-    """Where a panel stands; panels at the same place keep their order."""
+    """Where the panel of a column stands; panels at the same place keep their order."""
     named = (i for i, pattern in enumerate(_ORDER) if pattern and re.search(pattern, name))
     return next(named, _ORDER.index(_REST))
 
@@ -135,6 +145,11 @@ def _draw(ax: Axes, name: str, lines: Sequence[tuple[str, str, pd.Series]]) -> N
     low, high = np.quantile(everything, [0.05, 0.95])
     if everything.min() > 0 and high > 100 * low:
         ax.set_yscale("log")
+    else:
+        ax.ticklabel_format(axis="y", useOffset=False)
+    if _SCORE.match(name):
+        ax.set_ylim(min(0.0, everything.min()), 1)
+    ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     ax.set_title(name, fontsize=10, fontweight="bold")
     ax.tick_params(labelsize=8)
     ax.grid(visible=True, color="#e3e6ea", linewidth=0.6)
