@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -26,7 +27,7 @@ def conv_norm(inputs: int, outputs: int, kernel: int = 3, stride: int = 1) -> nn
 def mlp(sizes: Sequence[int]) -> nn.Sequential:
     """Linear layers with CELU between them; the last one is linear."""
     layers: list[nn.Module] = []
-    for inputs, outputs in zip(sizes[:-1], sizes[1:], strict=True):
+    for inputs, outputs in itertools.pairwise(sizes):
         layers += [nn.Linear(inputs, outputs), nn.CELU()]
     return nn.Sequential(*layers[:-1])
 
@@ -74,7 +75,7 @@ class SubpixelDecoder(nn.Module):
         widths = [width * min(4, 2 ** (doublings - 1 - i)) for i in range(doublings)]
         self.stem = nn.Linear(latent, widths[0] * 16)
         blocks: list[nn.Module] = [nn.Unflatten(1, (widths[0], 4, 4)), nn.CELU()]
-        for inputs, after in zip(widths[:-1], widths[1:], strict=True):
+        for inputs, after in itertools.pairwise(widths):
             blocks += [nn.Conv2d(inputs, 4 * after, 3, padding=1), nn.PixelShuffle(2), group_norm(after), nn.CELU()]
         self.blocks = nn.Sequential(*blocks)
         self.head = nn.Sequential(nn.Conv2d(width, 4 * outputs, 3, padding=1), nn.PixelShuffle(2))

@@ -125,6 +125,7 @@ class DLA(nn.Module):
             maps.append(x)
         for start, stage in zip(range(len(maps) - 2, -1, -1), self.stages, strict=True):
             fine = maps[start]
+            assert isinstance(stage, nn.ModuleList)
             for i, merge in enumerate(stage, start=start):
                 fine = maps[i + 1] = merge(maps[i + 1], fine)
         return self.head(maps[-1])

@@ -21,7 +21,7 @@ from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.spatial_transformer import Paster, pixel_centres
 from apex_lab.scene import Scene, schedule_at
 
-SCHEDULE = schedule_at({"temperature": 0.7, "discovery_presence": 0.1, "carry": 1.0})
+SCHEDULE = schedule_at({"temperature": 0.7, "discovery_presence": 0.1, "carry": 1.0, "discover": 0.8})
 
 
 def tiny(**changes: object) -> Apex:
@@ -181,7 +181,7 @@ def test_gradients_stay_finite_with_all_or_no_objects_and_extreme_windows(logit:
         model.discovery.head_pres[-1].bias.fill_(logit)
         model.discovery.head_where.bias[:2] = size
     scene = model(video(), SCHEDULE)
-    assert ((scene.ids[:, 0, :3] >= 0).all() if logit > 0 else (scene.ids[:, :, :3] == -1).all())
+    assert (scene.ids[:, 0, :3] >= 0).all() if logit > 0 else (scene.ids[:, :, :3] == -1).all()
     sum(scene.terms.values()).sum().backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
 
@@ -230,18 +230,14 @@ def test_propagation_alone_tracks_a_moving_square_exactly() -> None:
         propagation.head_pres[-1].bias.fill_(20.0)
     half = torch.logit(torch.tensor(0.25))
     place = torch.stack([half, half, torch.tensor(0.0), torch.tensor(-0.5)])[None, None]
-    state = Objects(
-        torch.randn(1, 1, 6), place, torch.ones(1, 1), *(torch.zeros(1, 1, 12) for _ in range(4))
-    )
+    state = Objects(torch.randn(1, 1, 6), place, torch.ones(1, 1), *(torch.zeros(1, 1, 12) for _ in range(4)))
     solid = torch.full((1, 1, 8, 8), 5.0)
     masks = ApexNormalisation()
     centres = pixel_centres(size, torch.zeros(()))
     e = torch.randn(1, 8, 8, 8)
     valid = torch.ones(1, 1, dtype=torch.bool)
     for t in range(1, 6):
-        state, _ = propagation(
-            state, model.glimpses, model.appearance, e, e, valid, SCHEDULE["temperature"], False
-        )
+        state, _ = propagation(state, model.glimpses, model.appearance, e, e, valid, SCHEDULE["temperature"], False)
         composed = masks.compose(solid, state.presence, valid, Paster(window_of(state.place), 8, size))
         truth = (centres.abs() < 0.25)[:, None] & ((centres - (-0.5 + t * 4 / size)).abs() < 0.25)[None]
         assert torch.equal(composed.objects[0, 0] > 0.5, truth)
@@ -319,7 +315,7 @@ def test_the_background_starts_at_the_median() -> None:
 
 def test_refusals() -> None:
     with pytest.raises(ValueError, match=r"model\.image_size=48"):
-        Apex(48, **{k: v for k, v in tiny_parts().items()})
+        Apex(48, **tiny_parts())
     with pytest.raises(ValueError, match="built for 32 px"):
         tiny()(torch.rand(1, 2, 3, 64, 64), SCHEDULE)
 

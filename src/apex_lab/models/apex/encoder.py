@@ -1,4 +1,4 @@
-"""APEX's scene encoder: DLA per frame, then a ConvLSTM over time, output stride 4 (apex_paper, "Feature Extraction")."""
+"""APEX's scene encoder: DLA per frame, then a ConvLSTM over time, stride 4 (apex_paper, "Feature Extraction")."""
 
 from __future__ import annotations
 

@@ -42,9 +42,7 @@ class Glimpses(nn.Module, ABC):
         """Channels of the sources of glimpses and of propagation crops."""
 
     @abstractmethod
-    def sources(
-        self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]
-    ) -> tuple[Tensor, Tensor]:
+    def sources(self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]) -> tuple[Tensor, Tensor]:
         """What glimpses and propagation crops are cut from, each (B, T, C, h, w)."""
 
     def look(self, source: Float[Tensor, "B C h w"], window: Float[Tensor, "B K 4"]) -> Float[Tensor, "B K code"]:
@@ -66,9 +64,7 @@ class FeatureGlimpses(Glimpses):
         """F for both."""
         return features, features
 
-    def sources(
-        self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]
-    ) -> tuple[Tensor, Tensor]:
+    def sources(self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]) -> tuple[Tensor, Tensor]:
         """The feature maps themselves."""
         return features, features
 
@@ -82,9 +78,7 @@ class ImageGlimpses(Glimpses):
         """RGB; RGB of two frames."""
         return 3, 6
 
-    def sources(
-        self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]
-    ) -> tuple[Tensor, Tensor]:
+    def sources(self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]) -> tuple[Tensor, Tensor]:
         """x_t, and [x_t, x_{t-1}] (the first frame is its own predecessor)."""
         centred = video - 0.5
         before = torch.cat([centred[:, :1], centred[:, :-1]], dim=1)

@@ -73,9 +73,7 @@ class ApexNormalisation(MaskNormalisation):
             warp pads with zeros), `minus_c` pads with the weakest logit.
     """
 
-    def __init__(
-        self, c: Annotated[float, Field(gt=0)] = 5.0, outside: Literal["zero", "minus_c"] = "zero"
-    ) -> None:
+    def __init__(self, c: Annotated[float, Field(gt=0)] = 5.0, outside: Literal["zero", "minus_c"] = "zero") -> None:
         self.c, self.outside = c, outside
 
     def logits(self, raw: Float[Tensor, "..."]) -> Float[Tensor, "..."]:

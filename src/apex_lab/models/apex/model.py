@@ -7,7 +7,7 @@ from typing import Annotated
 import torch
 from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
 from apex_lab.models.apex.background import Background
 from apex_lab.models.apex.encoder import ApexEncoder
@@ -68,7 +68,7 @@ class Apex(SceneModel):
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
-    schedule_names = ("temperature", "discovery_presence", "carry")
+    schedule_names = ("temperature", "discovery_presence", "carry", "discover")
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class Apex(SceneModel):
         super().__init__()
         if image_size % 32 or (image_size // encoder.stride) % grid:
             raise ValueError(
-                f"model.image_size={image_size} must be a multiple of 32 whose quarter is a multiple of model.grid={grid}"
+                f"model.image_size={image_size} must be a multiple of 32, its quarter one of model.grid={grid}"
             )
         self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
         self.render_top = min(render_top or grid**2, grid**2)
@@ -124,7 +124,8 @@ class Apex(SceneModel):
         Args:
             video: RGB in [0, 1].
             schedule: `temperature` of the relaxed Bernoulli; `discovery_presence` p0; `carry`, the probability in
-                [0, 1] with which a video's objects are carried into the next frame in training (see `_carried_on`).
+                [0, 1] with which a video's objects are carried into the next frame in training (see `_carried_on`);
+                `discover`, the probability in [0, 1] with which a carried video may discover too (see `_may_discover`).
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
@@ -154,6 +155,7 @@ class Apex(SceneModel):
         paster = self._paster(proposals.place, alphas.shape[-1])
         claims = self.masks.claim(alphas, paster)
         rows, columns = paster.inside()
+        carried_on = torch.zeros(b, 1, dtype=torch.bool, device=look_at.device)
         steps = []
         for i in range(t):
             before, beliefs = self.propagation(
@@ -169,9 +171,10 @@ class Apex(SceneModel):
             alpha = self._alpha(before.what)
             scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
 
-            prob = proposals.prob[:, i] * context_probability(scope, claims[:, i])  # Eq. 17
-            prior = schedule["discovery_presence"] * scope_in_windows(scope, rows[:, i], columns[:, i])
-            pres = sample_presence(prob, schedule["temperature"], self.training)
+            open_ = self._may_discover(carried_on, schedule).to(scope.dtype)
+            prob = proposals.prob[:, i] * context_probability(scope, claims[:, i]) * open_  # Eq. 17
+            prior = schedule["discovery_presence"] * scope_in_windows(scope, rows[:, i], columns[:, i]) * open_
+            pres = sample_presence(prob, schedule["temperature"], self.training) * open_
             top = prob.detach().topk(self.render_top, dim=1).indices
             found = self._found(proposals, i, pres, top)
 
@@ -195,7 +198,8 @@ class Apex(SceneModel):
                 )
             )
             state, ids, next_id = candidates.gather(kept.source), kept.ids, kept.next_id
-            valid = kept.valid & self._carried_on(b, schedule)
+            carried_on = self._carried_on(b, schedule)
+            valid = kept.valid & carried_on
         return stack_steps(steps)
 
     def _carried_on(self, batch: int, schedule: Schedule) -> Tensor:
@@ -208,6 +212,17 @@ class Apex(SceneModel):
         if not self.training:
             return torch.ones(batch, 1, dtype=torch.bool, device=schedule["carry"].device)
         return torch.rand(batch, 1, device=schedule["carry"].device) < schedule["carry"]
+
+    def _may_discover(self, carried_on: Tensor, schedule: Schedule) -> Tensor:
+        """Which videos may discover objects in this frame, (B, 1); all in evaluation.
+
+        Rediscovering everything in every frame explains a video as well as tracking does, for the price of a few KL
+        terms, and once the presence of propagated objects has died nothing revives it. So in training a video that
+        carries objects is now and then left to them alone.
+        """
+        if not self.training:
+            return torch.ones_like(carried_on)
+        return ~carried_on | (torch.rand(carried_on.shape, device=carried_on.device) < schedule["discover"])
 
     def _found(self, proposals: Proposals, frame: int, pres: Tensor, top: Tensor) -> Objects:
         """The rendered discoveries of a frame as objects; their other recurrent states start at zero."""

@@ -256,9 +256,7 @@ def scope_in_windows(
     return inside / (rows.sum(-1) * columns.sum(-1)).clamp_min(1e-6)
 
 
-def context_probability(
-    scope: Float[Tensor, "B H W"], claims: Float[Tensor, "B D H W"]
-) -> Float[Tensor, "B D"]:
+def context_probability(scope: Float[Tensor, "B H W"], claims: Float[Tensor, "B D H W"]) -> Float[Tensor, "B D"]:
     """p_context: share of each proposal's mask that is not yet explained, in [0, 1] (Eq. 18)."""
     claims = claims.flatten(2)
     open_ = (claims @ scope.flatten(1)[..., None]).squeeze(-1)

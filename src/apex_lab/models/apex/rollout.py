@@ -16,10 +16,11 @@ class Step(NamedTuple):
 
     P propagated slots and N rendered discoveries are the R = P + N components that explain the frame.
 
-    what (B, R, Z), place (B, R, 4), alpha (B, R, g, g), presence (B, R): samples; invalid ones have a presence of zero.
-    valid (B, R). propagated: beliefs about the P slots. discovery_prob, discovery_prior, discovery_pres (B, D): q, p and
-    sample of the presence of all D cells. source (B, P), carried (B, P), ids (B, P): what the slots hold after
-    filtering, as in `slots.Carried`.
+    what (B, R, Z), place (B, R, 4), alpha (B, R, g, g), presence (B, R): samples; presence is zero where not valid.
+    valid (B, R).
+    propagated: beliefs about the P slots.
+    discovery_prob, discovery_prior, discovery_pres (B, D): q, p and sample of the presence of all D cells.
+    source (B, P), carried (B, P), ids (B, P): what the slots hold after filtering, as in `slots.Carried`.
     """
 
     what: Tensor
@@ -49,4 +50,3 @@ def stack_steps(steps: list[Step]) -> Step:
         return kind(*(stacked(list(column)) for column in columns))
 
     return cast(Step, stacked(list(steps)))
-
