@@ -13,6 +13,7 @@ from sklearn.metrics import adjusted_rand_score
 from torch import Tensor
 
 from apex_lab.metrics import SceneMetrics, scene_identities
+from apex_lab.metrics.evaluator import Evaluator
 from apex_lab.models.background_subtraction import BackgroundSubtraction
 from apex_lab.models.color_clusters import ColorClusters
 from apex_lab.models.linking import link
@@ -145,6 +146,13 @@ def test_oracle_scores_all_ones() -> None:
     scores = SceneMetrics()
     scores.update(scene_identities(scene, labels.shape[-2:]), labels.long())
     assert all(value == 1.0 for value in scores.compute().values())
+    evaluator = Evaluator()
+    for b in range(len(video)):
+        evaluator.add(str(b), scene_identities(scene, labels.shape[-2:])[b].numpy(), labels[b].numpy())
+    total = evaluator.result()["total"]
+    assert all(total[name] == 100.0 for name in ("mota", "motp", "match", "md", "mt"))
+    assert all(total[name] == 0.0 for name in ("id_switches", "fps", "misses"))
+    assert all(total[name] == 1.0 for name in ("idf1", "hota", "jf", "mbo", "video_ari", "video_ari_fg"))
     assert torch.equal(scene.segmentation(), labels.long())
     assert scene.ids[0, :, 3].tolist() == [3, 3, ABSENT, 3, 3, 3]
     assert torch.equal(scene.reconstruction, video)
