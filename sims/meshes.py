@@ -71,7 +71,7 @@ def corner_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     return normals
 
 
-def hull_vertices(points: np.ndarray, directions: int = 160) -> np.ndarray:
+def hull_vertices(points: np.ndarray, directions: int = 100) -> np.ndarray:
     """(N, 3): the extreme points of a cloud in evenly spread directions; a light convex hull for contacts."""
     index = np.arange(directions) + 0.5
     height = 1 - 2 * index / directions
@@ -86,8 +86,8 @@ def hull_vertices(points: np.ndarray, directions: int = 160) -> np.ndarray:
 def convex_parts(points: np.ndarray, name: str, convex: bool) -> list[np.ndarray]:
     """Vertex clouds whose hulls make up the collision body.
 
-    A shape that is not convex is cut across its longest horizontal side into slices (a banana), a mug into its cup, which
-    is solid for contacts, and its handle.
+    A shape that is not convex is cut across its longest horizontal side into slices (a banana), a mug into its cup,
+    which is solid for contacts, and its handle.
     """
     if convex:
         return [hull_vertices(points)]

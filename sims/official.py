@@ -1,4 +1,4 @@
-"""Textured models that a person brings along: a folder with one sub-folder per object, an OBJ and its picture in each."""
+"""Textured models that a person brings along: one sub-folder per object, with an OBJ and its picture."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ def find(root: str, name: str) -> TexturedModel:
     if place is None:
         found = ", ".join(path.name for path in there.values()) or "nothing"
         raise SimError(
-            f"objects_root {root!r} has no sub-folder for object {name!r} (there is {found}): add it, or list in objects "
-            "only what is there."
+            f"objects_root {root!r} has no sub-folder for object {name!r} (there is {found}): add it, or name in "
+            "objects only what is there."
         )
     meshes = [path for path in sorted(place.rglob("*.obj")) if _has_texture_coordinates(path)]
     if not meshes:
@@ -93,14 +93,14 @@ def load(model: TexturedModel) -> trimesh.Trimesh:
     mesh = trimesh.load_mesh(model.mesh, process=False)
     if isinstance(mesh, trimesh.Scene):
         mesh = mesh.to_mesh()
-    if not isinstance(mesh, trimesh.Trimesh) or not hasattr(mesh.visual, "uv") or mesh.visual.uv is None:
+    if not isinstance(mesh, trimesh.Trimesh) or getattr(mesh.visual, "uv", None) is None:
         raise SimError(f"{model.mesh} has texture coordinates that do not belong to its faces: export it again.")
     return mesh
 
 
 def texture_coordinates(mesh: trimesh.Trimesh) -> np.ndarray:
     """(V, 2) of a mesh from `load`, v upwards."""
-    return np.asarray(mesh.visual.uv)  # type: ignore[union-attr]
+    return np.asarray(getattr(mesh.visual, "uv"))  # noqa: B009, not every kind of visual has it
 
 
 def picture_of(model: TexturedModel) -> Image.Image:

@@ -1,4 +1,4 @@
-"""Outlines of convex bodies in the picture: where a body may cover something, and where its shadow falls on the table."""
+"""Outlines of convex bodies in the picture: what they can cover, and where their shadow falls on the table."""
 
 from __future__ import annotations
 
@@ -22,17 +22,16 @@ def cover(camera: Camera, size_px: int, points: np.ndarray) -> tuple[np.ndarray,
         The pixels and the largest depth in metres; all pixels for a body that reaches before the near plane.
     """
     pixels, depth = camera.project(points, size_px)
-    mask = np.zeros((size_px, size_px), dtype=np.uint8)
+    far = float(depth.max())
     if depth.min() < camera.near_m:
-        mask[:] = 1
-    else:
-        _fill(mask, pixels)
-        mask = cv2.dilate(mask, np.ones((3, 3), np.uint8))
-    return mask > 0, float(depth.max())
+        return np.ones((size_px, size_px), dtype=bool), far
+    mask = np.zeros((size_px, size_px), dtype=np.uint8)
+    cv2.fillConvexPoly(mask, cv2.convexHull(_fixed_point(pixels, size_px)), 255, shift=SUBPIXEL_BITS)
+    return np.asarray(cv2.dilate(mask, np.ones((3, 3), np.uint8))) > 0, far
 
 
 def shadows(camera: Camera, size_px: int, bodies: list[np.ndarray], light: np.ndarray) -> np.ndarray:
-    """Share of light that convex bodies keep from the plane z = 0, (H, W) float32 in [0, 1], soft at the edge.
+    """Share of light that convex bodies keep from the plane z = 0, (H, W) uint8 in [0, 255], soft at the edge.
 
     The shadow of a convex body on a plane is the convex hull of its vertices' shadows, in the world and in the picture.
 
@@ -44,18 +43,17 @@ def shadows(camera: Camera, size_px: int, bodies: list[np.ndarray], light: np.nd
     fallen = points - np.maximum(points[:, 2:], 0) * (light / light[2])
     fallen[:, 2] = 0
     pixels, depth = camera.project(fallen, size_px)
+    fixed = _fixed_point(pixels, size_px)
     mask = np.zeros((size_px, size_px), dtype=np.uint8)
-    begin = 0
+    end = 0
     for body in bodies:
-        end = begin + len(body)
+        begin, end = end, end + len(body)
         if depth[begin:end].min() >= camera.near_m:
-            _fill(mask, pixels[begin:end])
-        begin = end
-    return cv2.GaussianBlur(mask, (0, 0), PENUMBRA * size_px).astype(np.float32) / 255
+            cv2.fillConvexPoly(mask, cv2.convexHull(fixed[begin:end]), 255, shift=SUBPIXEL_BITS)
+    return cv2.GaussianBlur(mask, (0, 0), PENUMBRA * size_px)
 
 
-def _fill(mask: np.ndarray, pixels: np.ndarray) -> None:
-    """Fill the convex hull of points (N, 2), given as (column, row) with pixel middles at + 0.5."""
-    limit = 8 * mask.shape[0]
-    fixed = np.rint((np.clip(pixels, -limit, limit) - 0.5) * 2**SUBPIXEL_BITS).astype(np.int32)
-    cv2.fillConvexPoly(mask, cv2.convexHull(fixed), 255, lineType=cv2.LINE_8, shift=SUBPIXEL_BITS)
+def _fixed_point(pixels: np.ndarray, size_px: int) -> np.ndarray:
+    """Points (N, 2), given as (column, row) with pixel middles at + 0.5, as OpenCV draws them with `SUBPIXEL_BITS`."""
+    limit = 8 * size_px
+    return np.rint((np.clip(pixels, -limit, limit) - 0.5) * 2**SUBPIXEL_BITS).astype(np.int32)

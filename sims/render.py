@@ -15,6 +15,8 @@ from sims.poses import moved
 from sims.stage import ARM_ID, FIRST_OBJECT_ID, HIDDEN_POSE, LIGHT_DIRECTION, Backend, Stage
 
 SHADOW_STRENGTH = 0.3
+LIGHT = (1 - SHADOW_STRENGTH * np.arange(256) / 255).astype(np.float32)
+"""What is left of a pixel's colour, by how much of its light is kept from it."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,6 @@ class Renderer:
     def __init__(self, camera: Camera, size_px: int, backend: Backend = "tiny") -> None:
         self.camera, self.size_px = camera, size_px
         self._empty = background(camera, size_px)
-        self._empty_rgb = np.rint(self._empty.rgb).astype(np.uint8)
         arm = panda.arm_model()
         self._links = panda.Links(arm)
         self._arm_stage = Stage(backend, arm)
@@ -133,11 +134,8 @@ class Renderer:
         for model, pose in zip(self._models, poses, strict=True):
             bodies += [moved(part, pose) for part in model.parts]
         dark = outlines.shadows(self.camera, self.size_px, bodies, np.array(LIGHT_DIRECTION))
-        shaded = (dark > 0) & self._empty.table
-        light = 1 - SHADOW_STRENGTH * dark[shaded, None]
-        rgb = self._empty_rgb.copy()
-        rgb[shaded] = np.rint(self._empty.rgb[shaded] * light).astype(np.uint8)
-        return rgb
+        light = LIGHT[dark * self._empty.table]
+        return np.rint(self._empty.rgb * light[..., None]).astype(np.uint8)
 
     def close(self) -> None:
         """Free the servers."""

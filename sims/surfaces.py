@@ -8,12 +8,12 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 BORDER_CELLS = 6
-SAMPLES_PER_CELL = 12
+SAMPLES_PER_CELL = 8
 OPENING_CELLS = 1
 BLUR_CELLS = 1.2
 
 
-def outer_surface(mesh: trimesh.Trimesh, cells: int = 160) -> trimesh.Trimesh:
+def outer_surface(mesh: trimesh.Trimesh, cells: int = 128) -> trimesh.Trimesh:
     """A watertight, slightly rounded surface around a mesh; what is inside is gone.
 
     CAD models consist of hundreds of open shells, which edge collapse tears apart. Here the mesh is put on a grid of
@@ -48,8 +48,8 @@ def level_set(field: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         Vertices (V, 3) in grid units and triangles (F, 3).
     """
-    total = np.zeros((*(side - 1 for side in field.shape), 3))
-    crossings = np.zeros(total.shape[:3])
+    shape = tuple(side - 1 for side in field.shape)
+    total, crossings = np.zeros((3, *shape)), np.zeros(shape)
     edges: list[tuple[list[np.ndarray], np.ndarray]] = []
     for axis in range(3):
         here, there = np.delete(field, -1, axis), np.delete(field, 0, axis)
@@ -57,25 +57,26 @@ def level_set(field: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
         corner = np.argwhere(crossed)
         position = corner.astype(np.float64)
         position[:, axis] += (level - here[crossed]) / (there[crossed] - here[crossed])
-        around = []
+        around: list[np.ndarray] = []
         for step in ((0, 0), (-1, 0), (-1, -1), (0, -1)):
             cell = corner.copy()
             cell[:, (axis + 1) % 3] += step[0]
             cell[:, (axis + 2) % 3] += step[1]
-            np.add.at(total, tuple(cell.T), position)
-            np.add.at(crossings, tuple(cell.T), 1)
-            around.append(cell)
+            place = np.asarray(np.ravel_multi_index(tuple(cell.T), shape))
+            crossings += np.bincount(place, minlength=crossings.size).reshape(shape)
+            for i in range(3):
+                total[i] += np.bincount(place, position[:, i], crossings.size).reshape(shape)
+            around.append(place)
         edges.append((around, here[crossed] > level))
     passed = crossings > 0
-    number = np.full(crossings.shape, -1)
-    number[passed] = np.arange(passed.sum())
+    number = np.cumsum(passed).reshape(-1) - 1
     quads = []
     for around, outward in edges:
-        quad = np.stack([number[tuple(cell.T)] for cell in around], axis=1)
+        quad = np.stack([number[place] for place in around], axis=1)
         quads.append(np.where(outward[:, None], quad, quad[:, ::-1]))
     quad = np.concatenate(quads)
     triangles = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
-    return total[passed] / crossings[passed][:, None], triangles
+    return (total[:, passed] / crossings[passed]).T, triangles
 
 
 def transferred_normals(vertices: np.ndarray, triangles: np.ndarray, smooth: trimesh.Trimesh) -> np.ndarray:

@@ -7,8 +7,8 @@
 | round | one strip around z, its height the polar angle from the top | all |
 | length | one strip around x, its height the place along x | all |
 
-The front faces -y, as the object frame's x axis runs along the longer side. Strips repeat a little at both ends, so that
-no triangle crosses the seam.
+The front faces -y, as the object frame's x axis runs along the longer side. Strips repeat a little at both ends, so
+that no triangle crosses the seam.
 """
 
 from __future__ import annotations

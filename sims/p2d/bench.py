@@ -71,7 +71,7 @@ class NaiveScene:
         for placement in spec.objects:
             self._add(placement.class_index, placement.position, placement.quaternion)
         ends = np.array([[*point, spec.height_m] for point in (spec.start, spec.end)])
-        angles, _ = panda.joint_path(self.bullet, arm, np.linspace(*ends, 12), spec.yaw_rad)
+        angles, _ = panda.joint_path(self.bullet, arm, np.linspace(ends[0], ends[1], 12), spec.yaw_rad)
         for _ in range(STEPS_PER_S // 4):
             call("stepSimulation")
         steps = steps_of(self.settings, spec)
@@ -142,9 +142,8 @@ def main() -> None:
         raise SystemExit(f"error: {error}") from error
     print(f"{settings.image_size} x {settings.image_size}, {settings.frames} frames, {words.trajectories} trajectories")
     for name, clock in (("naive scene", naive), ("P2D", product)):
-        print(
-            f"{name:12} {clock.per_core:6.1f} frames per second and core, {clock.frames / clock.wall_s:6.1f} on the wall clock"
-        )
+        wall = clock.frames / clock.wall_s
+        print(f"{name:12} {clock.per_core:6.1f} frames per second and core, {wall:6.1f} on the wall clock")
     print(f"ratio        {product.per_core / naive.per_core:6.1f}")
     whole = (settings.train + settings.val + settings.test) * settings.frames
     for cores in sorted({1, 2, os.cpu_count() or 1}):

@@ -38,10 +38,10 @@ class Settings(BaseModel):
     objects: Names = tuple(entry.name for entry in CATALOGUE)
     """Classes to draw from, without repetition within a trajectory."""
     objects_root: str | None = None
-    """Folder of textured models, one sub-folder per object with an OBJ and its PNG; None: the project's own textures."""
+    """Folder of textured models, one sub-folder per object with an OBJ and its PNG; None: textures drawn here."""
     workspace_x: Span = (0.39, 0.65)
     """Where objects are put and lines run, metres in front of the robot's base."""
-    workspace_y: Span = (-0.14, 0.14)
+    workspace_y: Span = (-0.17, 0.12)
     """Likewise to its left."""
     height_m: float = Field(default=0.012, ge=0.01, le=0.2)
     """Of the point between the fingertips, which end 7 mm lower, above the table."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from sims import arm as panda
 from sims.assets import ObjectModel, object_models
@@ -23,11 +24,13 @@ SETTLE_S = 1.5
 REST_M_S, REST_RAD_S = 0.005, 0.05
 REST_STEPS = 24
 RAMP_S = 0.25
-WAYPOINT_M = 0.03
+WAYPOINT_M = 0.06
 REACH_ERROR_M = 0.001
 START_GAP_M = 0.01
 IN_PICTURE = 0.9
 """Least share of an object's vertices within the picture's border, in every frame."""
+SEEN = 0.4
+"""Every object shows at least this share of itself in at least one frame."""
 STILL_M, STILL_RAD = 1e-4, 1e-3
 """An object that moved less than this since its last recorded pose keeps that pose: what rests is exactly at rest."""
 
@@ -60,8 +63,8 @@ def _renderer(process: int, settings: Settings) -> Renderer:
 def camera(settings: Settings) -> dict[str, object]:
     """The camera as plain JSON data.
 
-    intrinsics 3 x 3 (pixels), extrinsics 4 x 4 (world to camera, OpenCV axes), near and far in metres, eye and target in
-    metres, fov in degrees (vertical), image_size in pixels.
+    intrinsics 3 x 3 (pixels), extrinsics 4 x 4 (world to camera, OpenCV axes), near and far in metres, eye and target
+    in metres, fov in degrees (vertical), image_size in pixels.
     """
     view = settings.camera
     return {
@@ -87,14 +90,12 @@ def simulate(settings: Settings, split: str, index: int) -> Trajectory:
     for attempt in range(settings.max_redraws + 1):
         spec = sample(settings, split, index, attempt)
         try:
-            episode = push(settings, spec, models)
+            return _label(settings, spec, push(settings, spec, models), models)
         except Unusable as reason:
             reasons.append(str(reason))
-            continue
-        return _label(settings, spec, episode, models)
     raise SimError(
-        f"Trajectory {index} of split {split!r} (seed {settings.seed}) found no usable push in {len(reasons)} attempts, the "
-        f"last because {reasons[-1]}: check camera, workspace_x and workspace_y, or raise max_redraws."
+        f"Trajectory {index} of split {split!r} (seed {settings.seed}) found no usable push in {len(reasons)} attempts "
+        f"(the last: {reasons[-1]}): check camera, workspace_x and workspace_y, or raise max_redraws."
     )
 
 
@@ -131,7 +132,7 @@ def _settle(world: World) -> None:
 def _path(world: World, spec: Spec) -> np.ndarray:
     """(N, 7) joint angles at evenly spaced points of the line."""
     start, end = (np.array([*point, spec.height_m]) for point in (spec.start, spec.end))
-    count = max(2, int(np.ceil(np.linalg.norm(end - start) / WAYPOINT_M)) + 1)
+    count = max(4, int(np.ceil(np.linalg.norm(end - start) / WAYPOINT_M)) + 1)
     points = start + np.linspace(0, 1, count)[:, None] * (end - start)
     angles, error = panda.joint_path(world.bullet, world.arm, points, spec.yaw_rad)
     if error > REACH_ERROR_M:
@@ -166,7 +167,7 @@ def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[Ob
     steps = steps_of(settings, spec)
     share = progress(np.arange(steps + 2) / STEPS_PER_S, duration)
     knots = np.linspace(0, 1, len(path))
-    angles = np.stack([np.interp(share, knots, path[:, joint]) for joint in range(7)], axis=1)
+    angles = CubicSpline(knots, path)(share)
     fingers = np.zeros((len(angles), 2))
     positions = np.concatenate([angles, fingers], axis=1)
     speeds = (np.diff(positions, axis=0) * STEPS_PER_S).tolist()
@@ -190,8 +191,10 @@ def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[Ob
         _check(settings, poses, used)
         frames.append((poses, world.joints(), world.gripper(), arm_contact.copy(), object_contact.copy()))
         arm_contact[:], object_contact[:] = False, False
-    poses, joints, gripper, arm, other = (np.stack(column) for column in zip(*frames, strict=True))
-    return Episode(poses.astype(np.float32), joints.astype(np.float32), gripper.astype(np.float32), arm, other)
+    poses, joints, gripper, arm_touch, object_touch = (np.stack(column) for column in zip(*frames, strict=True))
+    return Episode(
+        poses.astype(np.float32), joints.astype(np.float32), gripper.astype(np.float32), arm_touch, object_touch
+    )
 
 
 def _steady(poses: np.ndarray, before: np.ndarray | None) -> np.ndarray:
@@ -216,7 +219,11 @@ def _check(settings: Settings, poses: np.ndarray, models: list[ObjectModel]) -> 
 
 
 def _label(settings: Settings, spec: Spec, episode: Episode, models: tuple[ObjectModel, ...]) -> Trajectory:
-    """Draw every frame of an episode and pad the slots."""
+    """Draw every frame of an episode and pad the slots.
+
+    Raises:
+        Unusable: an object is hidden, or nearly so, in all frames.
+    """
     renderer = _renderer(os.getpid(), settings)
     renderer.show(tuple(models[placement.class_index] for placement in spec.objects))
     used, slots = len(spec.objects), settings.max_objects
@@ -225,6 +232,9 @@ def _label(settings: Settings, spec: Spec, episode: Episode, models: tuple[Objec
         pictures.append(renderer.picture(joints, poses))
     segmentation = np.stack([picture.segmentation for picture in pictures])
     visible = np.stack([(segmentation == 1 + part).sum(axis=(1, 2)) for part in range(slots + 1)], axis=1)
+    amodal = np.stack([picture.amodal_px for picture in pictures])
+    if (visible[:, 1 : used + 1] / np.maximum(amodal[:, 1:], 1)).max(axis=0).min() < SEEN:
+        raise Unusable("an object is hidden in every frame")
     padded = slots - used
     return Trajectory(
         rgb=np.stack([picture.rgb for picture in pictures]),
@@ -235,7 +245,7 @@ def _label(settings: Settings, spec: Spec, episode: Episode, models: tuple[Objec
         joints=episode.joints,
         gripper=episode.gripper,
         visible_px=visible.astype(np.int32),
-        amodal_px=np.pad(np.stack([picture.amodal_px for picture in pictures]), ((0, 0), (0, padded))).astype(np.int32),
+        amodal_px=np.pad(amodal, ((0, 0), (0, padded))).astype(np.int32),
         arm_contact=np.pad(episode.arm_contact, ((0, 0), (0, padded))),
         object_contact=np.pad(episode.object_contact, ((0, 0), (0, padded), (0, padded))),
         aimed=spec.aimed,

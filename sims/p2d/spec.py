@@ -94,9 +94,9 @@ def sample(settings: Settings, split: str, index: int, attempt: int = 0) -> Spec
             return Spec(split, index, attempt, placements, start, end, settings.height_m, yaw, aimed)
     names = ", ".join(models[number].name for number in classes)
     raise SimError(
-        f"No arrangement of {names} with a line for the arm was found in workspace_x {settings.workspace_x}, workspace_y "
-        f"{settings.workspace_y} and the camera's picture: make the workspace larger, move the camera back, or lower "
-        f"max_objects {settings.max_objects}."
+        f"No arrangement of {names} with a line for the arm was found in workspace_x {settings.workspace_x}, "
+        f"workspace_y {settings.workspace_y} and the camera's picture: make the workspace larger, move the camera "
+        f"back, or lower max_objects {settings.max_objects}."
     )
 
 
@@ -179,8 +179,8 @@ def _in_picture(settings: Settings, points: np.ndarray) -> bool:
 def _pushed(each: _Placed, start: np.ndarray, end: np.ndarray, hand: np.ndarray) -> np.ndarray:
     """About where an object's vertices end when the hand, with corners `hand` (4, 2) at `start`, moves to `end`.
 
-    It slides before the hand without turning; simulating it afterwards finds out whether it really stays in the picture,
-    but lines that would surely push it out are dropped here at no cost.
+    It slides before the hand without turning. Simulating it afterwards finds out whether it really stays in the
+    picture, but lines that would surely push it out are dropped here at no cost.
     """
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length
