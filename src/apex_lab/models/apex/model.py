@@ -277,6 +277,12 @@ class Apex(SceneModel):
         }
         return self._scene(steps, masks, means, backdrop.unflatten(0, (b, t)), terms)
 
+    @staticmethod
+    def _shares(objects: Float[Tensor, "B T P H W"], at_most: int = 5) -> list[Tensor]:
+        """Mean share of pixels of the largest, second largest, ... object of a frame."""
+        ranked = objects.mean((-2, -1)).sort(dim=-1, descending=True).values.mean((0, 1))
+        return list(ranked[:at_most].unbind())
+
     def _scene(self, steps: Step, masks: Masks, means: Tensor, backdrop: Tensor, terms: dict[str, Tensor]) -> Scene:
         """The P objects carried on and the background, last. Pixels of objects that were dropped become background."""
         b, t = steps.source.shape[:2]
@@ -305,6 +311,7 @@ class Apex(SceneModel):
             windows=torch.cat([window, torch.full_like(window[..., :1, :], torch.nan)], dim=2),
             means=None if self.training else torch.cat([held(means), backdrop[:, :, None]], dim=2),
             diagnostics={
+                **{f"share_{i}": share for i, share in enumerate(self._shares(objects))},
                 "live_objects": carried.float().sum(-1).mean(),
                 "foreground": masks.foreground.mean(),
                 "window_size": (window[..., :2].mean(-1).nan_to_num().sum(-1) / live).mean(),
