@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from apex_lab.errors import UserError
-from apex_lab.learner import Learner, Stretches, as_float, noise_seed
+from apex_lab.learner import Learner, Stretches, as_float, foreground_share, noise_seed
 from apex_lab.loggers import Curves
 from apex_lab.schedules import Constant, Linear
 from tests.tiny import Layers, SquaresModule
@@ -110,7 +110,8 @@ def test_a_row_has_every_term_schedule_and_diagnostic() -> None:
     steps = [(step, sorted(row)) for step, row in kept.found]
     train = sorted(["train/loss", "train/error", "train/spread", "train/gradient_norm", "train/frames_per_second"])
     train = sorted([*train, "diagnostics/largest", "schedule/noise"])
-    val = sorted([f"val/{name}" for name in ("loss", "error", "spread", "ari", "ari_fg", "msc", "msc_fg")])
+    val = ["loss", "error", "spread", "foreground_share", "ari", "ari_fg", "msc", "msc_fg"]
+    val = sorted(f"val/{name}" for name in val)
     assert steps == [(1, train), (2, train), (2, val), (4, train), (4, val)]
     loss = kept.found[0][1]
     assert loss["train/loss"] == pytest.approx(loss["train/error"] + 0.5 * loss["train/spread"])
@@ -174,6 +175,16 @@ def test_stretches_hand_on_every_batch_once() -> None:
         found.append(batches)
         ours.step += len(batches)
     assert found == [[2], [3, 4, 5], [6, 7, 8]]
+
+
+def test_foreground_share_counts_pixels_that_are_not_background() -> None:
+    video = torch.rand(2, 3, 3, 8, 8)
+    model = Layers().eval()
+    scene = model(video, {})
+    identities = scene.segmentation()
+    share = foreground_share(scene, identities)
+    torch.testing.assert_close(share, (identities != 0).float().mean(dim=(1, 2, 3)))
+    assert 0 < share[0] < 1
 
 
 class Reads(TorchDispatchMode):

@@ -78,6 +78,8 @@ def test_a_run_leaves_everything_and_says_so(train: Callable[..., Ended], the_ru
     assert about["command"].startswith("python -m apex_lab.train --config-dir")
     assert about["versions"]["torch"] == torch.__version__
     assert about["hardware"]["device"] in ("cpu", "cuda")
+    assert 0 <= about["foreground_share"] <= 1
+    assert about["foreground_share"] == float(curves(run)[-1]["val/foreground_share"])
     names = ("config.yaml", "metrics.json", "objects.csv", "curves.csv", "log.txt", "checkpoints/last.ckpt")
     for name in (*names, "checkpoints/best.ckpt", "view/film_strip.png", "view/movie.mp4", "view/movie.gif"):
         assert (run / name).stat().st_size > 0, name

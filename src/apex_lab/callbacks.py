@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from typing import Annotated, Any, Literal
 
 import lightning as L
 from pydantic import Field
-from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
-from rich.progress import Progress as Bar
 
 from apex_lab import checkpoints, console
-from apex_lab.estimate import readable
 from apex_lab.interrupts import Deferred
 from apex_lab.learner import Learner
+from apex_lab.progress import Meter
 from apex_lab.runs import Run
 
 
@@ -74,6 +71,8 @@ class Checkpoints(L.Callback):
         if math.isfinite(value) and (self._best is None or self._sign * value > self._sign * self._best):
             self._best = value
             checkpoints.save(self._run.best, {**self._content(learner), "training": None})
+        share = trainer.callback_metrics.get("val/foreground_share")
+        self._run.update(foreground_share=None if share is None else float(share))
         self._save_last(learner)
         self._deferred.act()
 
@@ -111,7 +110,7 @@ class Checkpoints(L.Callback):
 
 
 class Progress(L.Callback):
-    """A bar with the time left on a terminal; elsewhere a line now and then.
+    """Shows how far training is, the loss, and the last validation scores.
 
     Args:
         seconds: between two lines where there is no terminal.
@@ -119,44 +118,31 @@ class Progress(L.Callback):
 
     def __init__(self, seconds: Annotated[float, Field(gt=0)] = 15.0) -> None:
         self._seconds = seconds
-        self._bar: Bar | None = None
-        self._task: TaskID | None = None
-        self._last = self._start = 0.0
+        self._meter: Meter | None = None
         self._first_step = 0
-        self._total = 0
 
     def on_train_start(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
         self._first_step = learner.step
-        self._total = learner.step + trainer.max_steps
-        self._start = self._last = time.monotonic()
-        if sys.stderr.isatty():
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-            self._bar = Bar(*columns, TextColumn("{task.fields[score]}"))
-            self._task = self._bar.add_task("training", total=self._total, completed=learner.step, score="")
-            self._bar.start()
+        self._meter = Meter("step", learner.step + trainer.max_steps, learner.step, self._seconds)
+        self._meter.__enter__()
 
     def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
         assert isinstance(learner, Learner)
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, completed=learner.step)
-        elif time.monotonic() - self._last >= self._seconds:
-            self._last = time.monotonic()
-            left = (self._last - self._start) / (learner.step - self._first_step) * (self._total - learner.step)
-            loss = float(learner.latest["train/loss"])
-            console.say(f"step {learner.step} of {self._total}, loss {loss:.1f}, {readable(left)} left")
+        assert self._meter is not None
+        if learner.step == self._first_step + 1:
+            self._meter.restart(learner.step)  # the first step also pays for what is set up once
+        elif self._meter.due():
+            self._meter.show(learner.step, f"loss {learner.logged_loss:.1f}")
 
     def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
-        names = {"val/ari_fg": "ARI-FG", "val/ari": "ARI", "val/msc": "MSC"}
+        names = {"val/ari_fg": "ARI-FG", "val/msc_fg": "MSC-FG", "val/ari": "ARI", "val/msc": "MSC"}
         metrics = trainer.callback_metrics
-        score = ", ".join(f"{short} {float(metrics[name]):.3f}" for name, short in names.items() if name in metrics)
-        if self._bar is not None and self._task is not None:
-            self._bar.update(self._task, score=score)
-        else:
-            console.say(f"step {learner.step} of {self._total}, validation: {score}")
+        scores = ", ".join(f"{short} {float(metrics[name]):.3f}" for name, short in names.items() if name in metrics)
+        console.say(f"step {learner.step}, validation: {scores}")
 
     def teardown(self, trainer: L.Trainer, learner: L.LightningModule, stage: str) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-            self._bar = None
+        if self._meter is not None:
+            self._meter.__exit__(None, None, None)
+            self._meter = None

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch.utils.data import DataLoader
 
 from apex_lab.files import make_folder, write_json, write_text
 from apex_lab.learner import Batch, as_float
 from apex_lab.metrics import scene_identities
 from apex_lab.metrics.evaluator import Evaluator
+from apex_lab.metrics.scenes import background_identities
+from apex_lab.progress import Meter
 from apex_lab.scene import Scene, SceneModel, Schedule
 from apex_lab.view import Item, render_all
 from apex_lab.view.item import one_video
@@ -33,7 +36,7 @@ def predict(model: SceneModel, batch: Batch, schedule: Schedule, precision: int 
 @torch.no_grad()
 def evaluate(
     model: SceneModel,
-    batches: Iterable[Batch],
+    batches: DataLoader[dict[str, Any]],
     schedule: Schedule,
     device: torch.device,
     precision: int | str = 32,
@@ -52,16 +55,19 @@ def evaluate(
     model.to(device).eval()
     evaluator = Evaluator()
     items: list[Item] = []
-    for batch in batches:
-        batch = {name: value.to(device) for name, value in batch.items()}
-        scene = predict(model, batch, schedule, precision)
-        truth = batch["segmentation"].cpu()
-        identities = scene_identities(scene, truth.shape[-2:]).cpu()
-        for b, index in enumerate(batch["index"].tolist()):
-            name = f"video {index}"
-            evaluator.add(f"{index:05d}", identities[b].numpy(), truth[b].numpy())
-            if len(items) < pictures:
-                items.append(Item(name, batch["video"][b : b + 1].cpu(), one_video(scene, b), 0, truth[b : b + 1]))
+    with Meter("video", len(batches.dataset)) as meter:  # type: ignore[arg-type]
+        for batch in batches:
+            batch = {name: value.to(device) for name, value in batch.items()}
+            scene = predict(model, batch, schedule, precision)
+            truth = batch["segmentation"].cpu()
+            identities = scene_identities(scene, truth.shape[-2:]).cpu()
+            backgrounds = background_identities(scene)
+            for b, index in enumerate(batch["index"].tolist()):
+                evaluator.add(f"{index:05d}", identities[b].numpy(), truth[b].numpy(), background_ids=backgrounds[b])
+                if len(items) < pictures:
+                    video = batch["video"][b : b + 1].cpu()
+                    items.append(Item(f"video {index}", video, one_video(scene, b), 0, truth[b : b + 1]))
+            meter.show(len(evaluator.records))
     return evaluator, items
 
 

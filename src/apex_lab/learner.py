@@ -14,12 +14,13 @@ from typing import Any
 
 import lightning as L
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from apex_lab.errors import UserError
 from apex_lab.metrics import SceneMetrics, scene_identities
+from apex_lab.metrics.scenes import background_identities
 from apex_lab.scene import Scene, SceneModel, Schedule
 
 Batch = Mapping[str, Any]
@@ -59,6 +60,7 @@ class Learner(L.LightningModule):
         self.step = step
         self.seed = seed
         self.latest: dict[str, Tensor] = {}
+        self.logged_loss = math.nan
         self._optimizer = optimizer
         self._schedules = schedules
         self._weights = weights
@@ -114,6 +116,7 @@ class Learner(L.LightningModule):
         self.step += 1
         if self.step % self._log_interval == 0 or self.step == 1:
             row = self.fetch()
+            self.logged_loss = row["train/loss"]
             row.update({f"schedule/{name}": value for name, value in values.items()})
             now = time.perf_counter()
             row["train/frames_per_second"] = self._frames / max(now - self._clock, 1e-9)
@@ -143,11 +146,15 @@ class Learner(L.LightningModule):
         self._validation_sums, self._validation_videos = {}, 0
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        video = as_float(batch["video"])
+        video, truth = as_float(batch["video"]), batch["segmentation"].long()
         scene = self.model(video, self.schedule())
-        self._validation.update(scene_identities(scene, batch["segmentation"].shape[-2:]), batch["segmentation"].long())
-        for name, values in {"loss": self.loss(scene.terms) * len(video), **scene.terms}.items():
-            self._validation_sums[name] = self._validation_sums.get(name, 0) + values.sum()
+        identities = scene_identities(scene, truth.shape[-2:])
+        self._validation.update(identities, truth)
+        values = {"loss": self.loss(scene.terms).expand(len(video)), **scene.terms}
+        if bool(scene.background.any()):
+            values["foreground_share"] = foreground_share(scene, identities)
+        for name, value in values.items():
+            self._validation_sums[name] = self._validation_sums.get(name, torch.zeros_like(value[0])) + value.sum()
         self._validation_videos += len(video)
 
     def on_validation_epoch_end(self) -> None:
@@ -199,6 +206,15 @@ class Stretches(Iterable[Batch]):
 def as_float(video: UInt8[Tensor, "B T 3 H W"]) -> Float[Tensor, "B T 3 H W"]:
     """RGB in [0, 1] from bytes, on the device where the bytes are."""
     return video.float() / 255.0
+
+
+def foreground_share(scene: Scene, identities: Int[Tensor, "B T H W"]) -> Float[Tensor, "B"]:
+    """Share of a video's pixels that the model gives to objects, not to its background."""
+    backgrounds = background_identities(scene)
+    given = [
+        torch.isin(video, video.new_tensor(sorted(ids))) for video, ids in zip(identities, backgrounds, strict=True)
+    ]
+    return torch.stack([1.0 - background.float().mean() for background in given])
 
 
 def noise_seed(seed: int, step: int) -> int:

@@ -1,0 +1,63 @@
+"""How far long work is and how much time is left: a bar on a terminal, a line now and then elsewhere."""
+
+from __future__ import annotations
+
+import sys
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from apex_lab import console
+from apex_lab.estimate import readable
+
+
+class Meter:
+    """Shows progress while it is open.
+
+    Args:
+        title: what is done.
+        total: how many there are.
+        done: how many were done before.
+        seconds: between two lines where there is no terminal.
+    """
+
+    def __init__(self, title: str, total: int, done: int = 0, seconds: float = 15.0) -> None:
+        self._title, self._total, self._seconds = title, total, seconds
+        self._first, self._began = done, time.monotonic()
+        self._told = self._began
+        self._bar: Progress | None = None
+        if sys.stderr.isatty():
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            self._bar = Progress(*columns, TextColumn("{task.fields[note]}"), console=Console(stderr=True))
+            self._task = self._bar.add_task(title, total=total, completed=done, note="")
+
+    def __enter__(self) -> Meter:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def due(self) -> bool:
+        """Whether `show` would show anything now, so that a note costs nothing when it would not."""
+        return self._bar is not None or time.monotonic() - self._told >= self._seconds
+
+    def restart(self, done: int) -> None:
+        """Measures speed from here on; what came before was slower."""
+        self._first, self._began = done, time.monotonic()
+
+    def show(self, done: int, note: str = "") -> None:
+        """Says how many are done, if it is time to."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, note=note)
+        elif self.due():
+            self._told = time.monotonic()
+            left = (self._told - self._began) / max(done - self._first, 1) * (self._total - done)
+            parts = [f"{self._title} {done} of {self._total}", *([note] if note else []), f"{readable(left)} left"]
+            console.say(", ".join(parts))
