@@ -85,7 +85,7 @@ class Stage:
 
         Where there is nothing depth is infinite.
         """
-        view, projection = _matrices(camera)
+        view, projection = _matrices(camera, size_px, self.backend)
         _, _, rgba, buffer, bodies = self.bullet.call(
             "getCameraImage",
             size_px,
@@ -134,5 +134,13 @@ def load_egl(bullet: Client) -> int:
 
 
 @lru_cache(maxsize=8)
-def _matrices(camera: Camera) -> tuple[list[float], list[float]]:
-    return camera.view_matrix(), camera.projection_matrix()
+def _matrices(camera: Camera, size_px: int, backend: Backend) -> tuple[list[float], list[float]]:
+    """View and projection, the latter moved so that a pixel shows what lies behind its middle.
+
+    TinyRenderer samples a pixel at its lower left corner, half a pixel from where a camera's intrinsics have it.
+    """
+    projection = camera.projection_matrix()
+    if backend == "tiny":
+        projection[8] += 1 / size_px
+        projection[9] += 1 / size_px
+    return camera.view_matrix(), projection

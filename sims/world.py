@@ -118,7 +118,9 @@ class World:
         """Who touches whom now: numbers of the objects that the arm touches, and pairs of touching objects."""
         call, objects = self.bullet.call, self.objects
         number = {body: i for i, body in enumerate(objects)}
-        with_arm = {point[2] for point in call("getContactPoints", self.arm) if point[8] <= TOUCH_M}
+        with_arm: set[int] = set()
+        if self.arm >= 0:
+            with_arm = {point[2] for point in call("getContactPoints", self.arm) if point[8] <= TOUCH_M}
         pairs = []
         for i, body in enumerate(objects):
             for j in range(i + 1, len(objects)):

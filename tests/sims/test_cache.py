@@ -1,0 +1,72 @@
+"""What is made once: whole or not at all, by one of many processes."""
+
+from __future__ import annotations
+
+import multiprocessing
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from sims import bullet, cache
+from sims.errors import SimError
+
+pytest.importorskip("pybullet")
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("APEX_LAB_CACHE", str(tmp_path / "cache"))
+
+
+def _slow_make(folder: Path) -> None:
+    (folder / "first").write_text("1")
+    time.sleep(0.3)
+    (folder / "second").write_text("2")
+
+
+def _ask(log: str) -> None:
+    def make(folder: Path) -> None:
+        with Path(log).open("a") as lines:
+            lines.write("made\n")
+        _slow_make(folder)
+
+    made = cache.made_once("thing", {"a": 1}, make)
+    assert (made / "first").read_text() == "1"
+    assert (made / "second").read_text() == "2"
+
+
+def test_many_processes_make_it_once(tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    context = multiprocessing.get_context("fork")
+    processes = [context.Process(target=_ask, args=(str(log),)) for _ in range(4)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join()
+    assert [process.exitcode for process in processes] == [0] * 4
+    assert log.read_text() == "made\n"
+
+
+def test_a_failure_leaves_nothing_behind() -> None:
+    def fail(folder: Path) -> None:
+        (folder / "first").write_text("1")
+        raise RuntimeError("broken")
+
+    with pytest.raises(RuntimeError, match="broken"):
+        cache.made_once("thing", {}, fail)
+    assert not [path for path in (cache.cache_folder() / "models").iterdir() if path.is_dir()]
+    assert (cache.made_once("thing", {}, _slow_make) / "second").is_file()
+
+
+def test_another_recipe_is_another_folder() -> None:
+    assert cache.made_once("thing", {"a": 1}, _slow_make) != cache.made_once("thing", {"a": 2}, _slow_make)
+
+
+def test_without_pybullet_one_sentence_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    with pytest.raises(SimError, match=r"use Python 3\.11"):
+        bullet.load_pybullet()
+    with pytest.raises(SimError, match=r"use Python 3\.11"):
+        cache.versions()
