@@ -11,9 +11,15 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from jaxtyping import install_import_hook
 from omegaconf import OmegaConf
 
-from apex_lab.config import Job, check_job, conf_dir, plain
+import tests.typechecked
+
+# Shapes and types of every call are checked in all tests; so the hook comes before the first import of apex_lab.
+install_import_hook("apex_lab", f"{tests.typechecked.__name__}.checked")
+
+from apex_lab.config import Job, check_job, conf_dir, plain  # noqa: E402
 
 REPOSITORY = Path(__file__).parent.parent
 TINY = (
