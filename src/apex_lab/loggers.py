@@ -6,6 +6,7 @@ import csv
 import io
 import netrc
 import os
+import secrets
 from argparse import Namespace
 from pathlib import Path
 from typing import Any, Literal
@@ -99,10 +100,10 @@ class Wandb(Logger):
         self, run: Run, project: str, entity: str | None = None, mode: Literal["auto", "online", "offline"] = "auto"
     ) -> None:
         super().__init__()
-        self._id = run.record.get("wandb_id")
         self._run = run
+        if "wandb_id" not in run.record:
+            run.update(wandb_id=secrets.token_hex(4))
         self._wandb = self._start(project, entity, mode)
-        run.update(wandb_id=self._wandb.id)
 
     @property
     def name(self) -> str:
@@ -131,8 +132,8 @@ class Wandb(Logger):
             "name": f"{group_name(job)}_seed_{job.config.seed}",
             "tags": [choices[key] for key in ("model", "ablation", "scale") if key in choices],
             "config": job.raw,
-            "id": self._id,
-            "resume": "allow" if self._id else None,
+            "id": self._run.record["wandb_id"],
+            "resume": "allow",
             "reinit": "finish_previous",
         }
         settings = wandb.Settings(
