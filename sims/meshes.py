@@ -83,6 +83,13 @@ def hull_vertices(points: np.ndarray, directions: int = 100) -> np.ndarray:
     return points[extreme]
 
 
+def dense_points(mesh: trimesh.Trimesh) -> np.ndarray:
+    """(N, 3): points all over a mesh whose triangles may be large, no farther apart than a thirtieth of its length."""
+    longest = float(np.ptp(np.asarray(mesh.vertices), axis=0).max()) / 30
+    vertices, _ = trimesh.remesh.subdivide_to_size(np.asarray(mesh.vertices), np.asarray(mesh.faces), longest, 20)[:2]
+    return np.unique(np.round(vertices, 6), axis=0)
+
+
 def convex_parts(points: np.ndarray, name: str, convex: bool) -> list[np.ndarray]:
     """Vertex clouds whose hulls make up the collision body.
 

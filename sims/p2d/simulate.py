@@ -14,12 +14,14 @@ from sims.assets import ObjectModel, object_models
 from sims.background import TABLE_HIGH_M, TABLE_LOW_M
 from sims.errors import SimError
 from sims.p2d.settings import Settings
-from sims.p2d.spec import Spec, sample
+from sims.p2d.spec import NoRoom, Spec, sample
 from sims.p2d.trajectory import Trajectory
 from sims.poses import moved
 from sims.render import Renderer
 from sims.world import STEPS_PER_S, World
 
+CROWDED = 15
+"""When so many attempts from the first on found no room for the objects, the settings are called impossible."""
 SETTLE_S = 1.5
 REST_M_S, REST_RAD_S = 0.005, 0.05
 REST_STEPS = 24
@@ -83,16 +85,23 @@ def simulate(settings: Settings, split: str, index: int) -> Trajectory:
     """Make one trajectory; its bytes depend on the settings, the split's name and the index alone.
 
     Raises:
-        SimError: PyBullet or a model is missing, or no attempt within `max_redraws` was usable.
+        SimError: PyBullet or a model is missing, the objects find no room, or no attempt within `max_redraws` was
+            usable.
     """
     models = object_models(settings.objects, settings.objects_root, settings.image_size)
     reasons: list[str] = []
+    crowded = 0
     for attempt in range(settings.max_redraws + 1):
-        spec = sample(settings, split, index, attempt)
         try:
+            spec = sample(settings, split, index, attempt)
             return _label(settings, spec, push(settings, spec, models), models)
         except Unusable as reason:
             reasons.append(str(reason))
+        except NoRoom as reason:
+            reasons.append("there was no room")
+            crowded += 1
+            if crowded == len(reasons) == CROWDED:
+                raise SimError(str(reason)) from None
     raise SimError(
         f"Trajectory {index} of split {split!r} (seed {settings.seed}) found no usable push in {len(reasons)} attempts "
         f"(the last: {reasons[-1]}): check camera, workspace_x and workspace_y, or raise max_redraws."

@@ -27,7 +27,12 @@ RUN_ON_M = (0.06, 0.16)
 BORDER = 0.015
 """Least distance of an object from the picture's border, as a share of its side."""
 DROP_M = 0.0005
-TRIES = 200
+TRIES = 20
+SAME_CLASSES = 5
+
+
+class NoRoom(SimError):
+    """The objects, or a line for the arm beside them, found no place."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +79,11 @@ def sample(settings: Settings, split: str, index: int, attempt: int = 0) -> Spec
     """Draw one attempt at a trajectory.
 
     How many objects, of which classes, and whether the line is aimed are the same for all attempts of a trajectory, so
-    that what is drawn again does not shift their shares; places, directions and the line are drawn anew.
+    that what is drawn again does not shift their shares; places, directions and the line are drawn anew, and after
+    `SAME_CLASSES` attempts the classes too.
 
     Raises:
-        SimError: no arrangement fits into the workspace and the picture.
+        NoRoom: no arrangement was found that fits into the workspace and the picture.
     """
     models = object_models(settings.objects, settings.objects_root, settings.image_size)
     shared = generator(settings, split, index)
@@ -85,6 +91,8 @@ def sample(settings: Settings, split: str, index: int, attempt: int = 0) -> Spec
     classes = [int(number) for number in shared.choice(len(models), size=count, replace=False)]
     aimed = bool(shared.random() < settings.aim)
     rng = generator(settings, split, index, attempt)
+    if attempt >= SAME_CLASSES:
+        classes = [int(number) for number in rng.choice(len(models), size=count, replace=False)]
     for _ in range(TRIES):
         objects = _place(settings, models, classes, rng)
         line = None if objects is None else _line(settings, objects, aimed, rng)
@@ -93,7 +101,7 @@ def sample(settings: Settings, split: str, index: int, attempt: int = 0) -> Spec
             placements = tuple(each.placement for each in objects)
             return Spec(split, index, attempt, placements, start, end, settings.height_m, yaw, aimed)
     names = ", ".join(models[number].name for number in classes)
-    raise SimError(
+    raise NoRoom(
         f"No arrangement of {names} with a line for the arm was found in workspace_x {settings.workspace_x}, "
         f"workspace_y {settings.workspace_y} and the camera's picture: make the workspace larger, move the camera "
         f"back, or lower max_objects {settings.max_objects}."

@@ -76,6 +76,7 @@ def test_textured_models_are_read_from_a_folder(tmp_path: Path, material: bool) 
     _textured_box(tmp_path / "brick", (0.05, 0.05, 0.08), material=material)
     sugar, brick = object_models(("sugar_box", "brick"), str(tmp_path))
     assert sugar.mass_kg == 0.514
+    assert sum(trimesh.convex.convex_hull(part).volume for part in brick.parts) == pytest.approx(2e-4, rel=0.2)
     assert brick.mass_kg == pytest.approx(0.05 * 0.05 * 0.08 * 300, rel=0.01)
     np.testing.assert_allclose(np.ptp(sugar.vertices, axis=0), [0.09, 0.04, 0.17], atol=1e-4)
     drawn = trimesh.load_mesh(sugar.visual, process=False)

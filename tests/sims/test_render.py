@@ -135,7 +135,9 @@ def test_depth_of_a_box_of_known_size(renderer: Renderer, tmp_path: Path) -> Non
     normals = meshes.corner_normals(vertices, triangles)
     meshes.write_obj(tmp_path / "cube.obj", vertices, triangles, normals, np.full((12, 3, 2), 0.5), "cube.png")
     Image.new("RGB", (4, 4), (200, 60, 60)).save(tmp_path / "cube.png")
-    cube = replace(object_models(("foam_brick",))[0], visual=tmp_path / "cube.obj", vertices=vertices, parts=(vertices,))
+    cube = replace(
+        object_models(("foam_brick",))[0], visual=tmp_path / "cube.obj", vertices=vertices, parts=(vertices,)
+    )
     renderer.show((cube,))
     pose = np.array([0.52, 0.0, side / 2, 0, 0, 0, 1.0])
     picture = renderer.picture(FAR_AWAY, pose[None])

@@ -59,7 +59,9 @@ def test_a_sliding_box_stops_after_the_way_that_friction_allows(world: World) ->
     world.bullet.call("resetBaseVelocity", body, [speed, 0, 0], [0, 0, 0])
     for _ in range(STEPS_PER_S):
         world.step()
-    friction = world.bullet.call("getDynamicsInfo", body, -1)[1] * world.bullet.call("getDynamicsInfo", world.table, -1)[1]
+    friction = (
+        world.bullet.call("getDynamicsInfo", body, -1)[1] * world.bullet.call("getDynamicsInfo", world.table, -1)[1]
+    )
     way = np.linalg.norm(world.poses()[0, :2] - start)
     assert way == pytest.approx(speed**2 / (2 * friction * 9.81), rel=0.15)
 
