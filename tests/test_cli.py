@@ -16,6 +16,8 @@ REFUSED = {
     "+ablaton=no_entropy": "Unknown key ablaton = 'no_entropy'; did you mean 'ablation'?",
     "modle=tiny": "Unknown key modle = 'tiny'; did you mean 'model'?",
     "ablation=no_entropy": "ablation=no_entropy has no default to replace: write +ablation=no_entropy.",
+    "seed=0,1": "seed=0,1 holds several values: add -m to run them all, or write seed=[0,1] for a list.",
+    "++hydra.job.nme=x": "Unknown key hydra.job.nme=x; did you mean 'name'?",
     "+seed=3": "seed is there already: write seed=3 without the +.",
     "trainer.max_steps=abc": "trainer.max_steps = 'abc' is wrong: input should be a valid integer.",
     "++trainer.max_steps=abc": "trainer.max_steps = 'abc' is wrong: input should be a valid integer.",
@@ -75,6 +77,14 @@ def test_refuses_before_anything_starts(word: str, train: Callable[..., Ended], 
 def test_every_job_of_a_sweep_is_checked_before_the_first_starts(train: Callable[..., Ended], tmp_path: Path) -> None:
     refused(train("seed=0,1,-2,3", "-m"), "seed = -2 is wrong", tmp_path)
     refused(train("model.components=2,3,1", "seed=range(2)", "-m"), "components = 1 leaves no room", tmp_path)
+
+
+def test_hydra_s_own_keys_can_be_set(train: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(train("++hydra.job.env_set.COLOUR=red", "hydra.verbose=false", "seed=x"), "seed = 'x' is wrong", tmp_path)
+
+
+def test_a_sweep_without_the_option_m(train: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(train("hydra.mode=MULTIRUN", "seed=0,x"), "seed = 'x' is wrong", tmp_path)
 
 
 def test_a_gpu_that_is_not_there(train: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

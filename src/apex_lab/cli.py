@@ -106,7 +106,9 @@ def _preflight(config_name: str, check: Check) -> None:
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(version_base="1.3", config_dir=arguments.config_path or str(conf_dir())):
-            for overrides in _expand(arguments.overrides) if arguments.multirun else [arguments.overrides]:
+            _check_hydra_keys(name, extra, arguments.overrides)
+            sweep = arguments.multirun or "hydra.mode=MULTIRUN" in arguments.overrides
+            for overrides in _expand(arguments.overrides) if sweep else [arguments.overrides]:
                 _check_composed(name, extra, overrides, check)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(_told(error, arguments.overrides)) from error
@@ -134,6 +136,25 @@ def _check_composed(name: str, extra: Sequence[str], overrides: Sequence[str], c
         attempt([f"++{word}" if word.startswith(f"{key}=") else word for word in overrides])
         word = next(word for word in overrides if word.startswith(f"{key}="))
         raise UserError(f"{key} is set by no file that was chosen: write ++{word} to add it.") from error
+
+
+_FREE = ("hydra.job.env_set.", "hydra.sweeper.params.")
+"""Keys of Hydra's own configuration whose names its user chooses."""
+
+
+def _check_hydra_keys(name: str, extra: Sequence[str], overrides: Sequence[str]) -> None:
+    """Refuses keys that Hydra's own configuration does not have, which `+` and `++` would add without a word."""
+    added = [word for word in overrides if re.match(r"\+\+?hydra\.", word) and not word.lstrip("+").startswith(_FREE)]
+    if not added:
+        return
+    groups = [word for word in overrides if word.startswith("hydra/")]
+    known = compose(name, overrides=[*extra, *groups], return_hydra_config=True)
+    for word in added:
+        key = word.lstrip("+").split("=", 1)[0]
+        parent, _, last = key.rpartition(".")
+        siblings = OmegaConf.select(known, parent, default={})
+        if last not in siblings:
+            raise UserError(sentence(f"Unknown key {word.lstrip('+')}{did_you_mean(last, map(str, siblings))}"))
 
 
 def _expand(overrides: Sequence[str]) -> list[list[str]]:
@@ -172,6 +193,10 @@ def _told(error: Exception, overrides: Sequence[str]) -> str:
         group, _, word = str(error.missing_cfg_file).rpartition("/")
         guess = did_you_mean(word, error.options)
         return sentence(f"{group}={word}: there is no such choice in {', '.join(error.options)}{guess}")
+    several = re.match(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
+    if several:
+        key, values = several.groups()
+        return f"{key}={values} holds several values: add -m to run them all, or write {key}=[{values}] for a list."
     if isinstance(error, OverrideParseException):
         return sentence(f"'{error.override}' cannot be read as key=value: {text.splitlines()[0]}")
     unlisted = re.match(r"Could not override '([^']+)'\.\s+No match in the defaults list", text)
