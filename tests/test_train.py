@@ -80,7 +80,7 @@ def test_a_run_leaves_everything_and_says_so(train: Callable[..., Ended], the_ru
     assert about["hardware"]["device"] in ("cpu", "cuda")
     assert 0 <= about["foreground_share"] <= 1
     assert about["foreground_share"] == float(curves(run)[-1]["val/foreground_share"])
-    names = ("config.yaml", "metrics.json", "objects.csv", "curves.csv", "log.txt", "checkpoints/last.ckpt")
+    names = ("config.yaml", "metrics.json", "objects_test.csv", "curves.csv", "log.txt", "checkpoints/last.ckpt")
     for name in (*names, "checkpoints/best.ckpt", "view/film_strip.png", "view/movie.mp4", "view/movie.gif"):
         assert (run / name).stat().st_size > 0, name
     total = json.loads((run / "metrics.json").read_text())["splits"]["test"]["total"]
@@ -88,7 +88,8 @@ def test_a_run_leaves_everything_and_says_so(train: Callable[..., Ended], the_ru
     heading = next(i for i, line in enumerate(lines) if line.split() == ["ARI-FG", "MSC-FG", "ARI", "MSC"])
     row = [float(number) for number in lines[heading + 1].split()]
     assert row == [round(total[key], 3) for key in ("ari_fg", "msc_fg", "ari", "msc")]
-    paths = lines[heading + 2 :]
+    assert lines[heading + 2].split() == ["MOTA", "MOTP", "Match", "ID", "S.", "FPs", "Miss", "MD", "MT"]
+    paths = lines[heading + 4 :]
     assert paths[0].endswith("film_strip.png")
     assert all((run.parents[2] / path).is_file() for path in paths)
     assert [row["step"] for row in curves(run)] == ["1", "2", "3", "4", "5", "6"]

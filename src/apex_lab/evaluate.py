@@ -1,7 +1,8 @@
-"""Scores a checkpoint on a split and draws what it sees.
+"""Scores models of this repository, and predictions that other programs made.
 
 python -m apex_lab.evaluate checkpoint=outputs/<run>/seed_0
-python -m apex_lab.evaluate checkpoint=weights.ckpt split=val videos=20
+python -m apex_lab.evaluate 'checkpoint=[weights.ckpt, outputs/<run>]' split=val
+python -m apex_lab.evaluate predictions=other.npz
 """
 
 from __future__ import annotations
@@ -13,11 +14,13 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from apex_lab import checkpoints, cli, components, config, console, evaluation
+from apex_lab import cli, config, console
 from apex_lab.errors import UserError
-from apex_lab.files import read_json
-from apex_lab.scene import schedule_at
-from apex_lab.validation import one_line, sentence, validate
+from apex_lab.evaluation import Export, ScoringPart
+from apex_lab.evaluation.checkpoint import Request, evaluate_checkpoint, find, load
+from apex_lab.evaluation.others import Predictions, check_output, output_of, score_others
+from apex_lab.metrics import KEYS
+from apex_lab.validation import did_you_mean, sentence, shown, validate
 
 
 class EvaluateConfig(BaseModel):
@@ -25,108 +28,155 @@ class EvaluateConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    checkpoint: str = Field(min_length=1)
     split: Literal["train", "val", "test"]
+    checkpoint: str | list[str] | None
     videos: int | None = Field(ge=1)
     pictures: int = Field(ge=0)
+    pictures_by: str
+    export: Export | None
     accelerator: Literal["auto", "cpu", "gpu"]
     folder: str | None = Field(min_length=1)
+    save_interval: int = Field(ge=1)
+    again: bool
+    predictions: str | None = Field(min_length=1)
+    format: Literal["npz", "coco", "davis", "mots"] | None
+    truth: str | None = Field(min_length=1)
+    partial: bool
+    resize: Literal["masks", "truth"] | None
+    output: str | None = Field(min_length=1)
+    scoring: ScoringPart
     paths: config.PathsPart
+
+
+OF_CHECKPOINTS = {"videos": None, "export": None, "folder": None, "again": False}
+OF_PREDICTIONS = {"format": None, "truth": None, "partial": False, "resize": None, "output": None}
+"""Keys that mean something for one kind of evaluation alone, and what they say where nobody asks."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One checked evaluation: what is asked for, the checkpoint file, its content, and the run that made it."""
+    """One checked command: predictions of another program, or checkpoint files."""
 
     asked: EvaluateConfig
-    file: Path
-    checkpoint: dict[str, Any]
-    job: config.Job
+    files: tuple[Path, ...] = ()
+    predictions: Predictions | None = None
 
 
 def main() -> None:
     """Entry point: `python -m apex_lab.evaluate`."""
-    cli.launch("evaluate", check_evaluation, evaluate, lambda job: str(job.file))
+    cli.launch("evaluate", check_evaluation, evaluate, title)
+
+
+def title(job: Evaluation) -> str:
+    """An evaluation in a few words."""
+    return str(job.predictions.path) if job.predictions is not None else ", ".join(str(file) for file in job.files)
 
 
 def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str]) -> Evaluation:
-    """Checks what is asked for and reads the checkpoint.
+    """Checks what is asked for, and reads every checkpoint once.
 
     Raises:
-        UserError: unknown key, impossible value, or no usable checkpoint; one sentence.
+        UserError: unknown key, impossible value, or something that cannot be evaluated; one sentence.
     """
     raw = {key: value for key, value in raw.items() if key != "hydra"}
     asked = validate(EvaluateConfig, raw, "")
     assert isinstance(asked, EvaluateConfig)
     config.refuse_missing(raw)
+    if asked.checkpoint is None and asked.predictions is None:
+        raise UserError("checkpoint is missing: write checkpoint=... or, for another program's, predictions=...")
+    if asked.checkpoint is not None and asked.predictions is not None:
+        raise UserError("checkpoint and predictions are both given: evaluate one after the other.")
+    if asked.predictions is not None:
+        _refuse(asked, OF_CHECKPOINTS, "checkpoint")
+        return Evaluation(asked, predictions=_predictions(asked))
+    _refuse(asked, OF_PREDICTIONS, "predictions")
+    ranks = [name for name, key in KEYS.items() if key.better is not None and "video" in key.levels]
+    if asked.pictures_by not in ranks:
+        hint = did_you_mean(asked.pictures_by, ranks) or f": choose one of {', '.join(ranks)}"
+        raise UserError(sentence(f"pictures_by = {shown(asked.pictures_by)} ranks no videos{hint}"))
     config.device(asked.accelerator)
-    file = checkpoint_file(Path(asked.checkpoint))
-    checkpoint = checkpoints.load(file)
-    stored = _moved(checkpoint["config"], asked)
-    try:
-        job = config.check_job(stored, checkpoint["choices"])
-    except UserError as error:
-        raise UserError(sentence(f"{file} was made by another version of apex_lab: {one_line(error)}")) from error
-    return Evaluation(asked, file, checkpoint, job)
-
-
-def checkpoint_file(path: Path) -> Path:
-    """The checkpoint that a path means: the file itself, or a run folder's last one.
-
-    Raises:
-        UserError: there is none.
-    """
-    if path.is_dir():
-        inside = path / "checkpoints" / "last.ckpt"
-        if inside.is_file():
-            return inside
-        runs = sorted(folder.name for folder in path.glob("seed_*"))
-        hint = f"; it holds {', '.join(runs)}: give one of them" if runs else ""
-        raise UserError(sentence(f"checkpoint = {path} is a folder without checkpoints/last.ckpt{hint}"))
-    if not path.is_file():
-        raise UserError(f"checkpoint = {path} does not exist: give a .ckpt file or a run folder.")
-    return path
+    files = find([asked.checkpoint] if isinstance(asked.checkpoint, str) else asked.checkpoint or [])
+    if not files:
+        raise UserError("checkpoint = [] names no file: give a .ckpt file or a run folder.")
+    for file in files:
+        load(file, asked.paths)
+    return Evaluation(asked, files=tuple(files))
 
 
 def evaluate(job: Evaluation) -> None:
-    """Scores, stores, draws and prints the row and the pictures' paths."""
-    asked, settings = job.asked, job.job.config
-    device = config.device(asked.accelerator)
-    model = config.build_model(settings)
-    try:
-        model.load_state_dict(job.checkpoint["weights"])
-    except RuntimeError as error:
-        raise UserError(sentence(f"The weights in {job.file} do not fit its model: {one_line(error)}")) from error
-    data = components.build(settings.data, "data")
-    data.prepare_data()
-    data.setup("test")
-    schedule = schedule_at({n: s(job.checkpoint["step"]) for n, s in config.build_schedules(settings).items()}, device)
-    batches = data.loader(asked.split, asked.videos)
-    evaluator, items = evaluation.evaluate(model, batches, schedule, device, settings.trainer.precision, asked.pictures)
-    folder = _folder(job)
-    asked_for = {"checkpoint": str(job.file), "split": asked.split, "videos": asked.videos}
-    stored = evaluation.store(folder, asked.split, evaluator, asked_for)
-    pictures = evaluation.draw(folder / "view", items)
-    console.say(evaluation.summary(asked.split, read_json(stored)["splits"][asked.split]))
-    for path in (stored, *pictures):
-        console.say(str(path))
+    """Scores, stores, draws; what fails does not keep the other checkpoints from being evaluated.
+
+    Raises:
+        UserError: some could not be evaluated.
+    """
+    if job.predictions is not None:
+        score_others(job.predictions)
+        return
+    request = _request(job.asked)
+    if len(job.files) == 1:
+        evaluate_checkpoint(request, job.files[0], alone=True)
+        return
+    failed = []
+    for number, file in enumerate(job.files):
+        console.say(f"checkpoint {number + 1} of {len(job.files)}: {file}")
+        try:
+            evaluate_checkpoint(request, file, alone=False)
+        except UserError as error:
+            console.error(str(error))
+            failed.append(str(file))
+    if failed:
+        raise UserError(f"{len(failed)} of {len(job.files)} checkpoints were not evaluated: {', '.join(failed)}.")
 
 
-def _folder(job: Evaluation) -> Path:
-    """Where the results go."""
-    if job.asked.folder is not None:
-        return Path(job.asked.folder)
-    words = [job.file.stem, job.asked.split, *([] if job.asked.videos is None else [str(job.asked.videos)])]
-    run = job.file.parent.parent
-    parent = run if (run / "run.json").is_file() else Path(job.asked.paths.outputs)
-    return parent / "evaluate" / "_".join(words)
+def _refuse(asked: EvaluateConfig, others: Mapping[str, Any], kind: str) -> None:
+    """Refuses keys of the other kind of evaluation, which would have no effect."""
+    for key, unset in others.items():
+        value = getattr(asked, key)
+        if value != unset:
+            raise UserError(f"{key} = {shown(value)} goes with {kind}=... alone: leave it out.")
 
 
-def _moved(stored: Mapping[str, Any], asked: EvaluateConfig) -> dict[str, Any]:
-    """The configuration of the run with the folders of this machine."""
-    old, new = stored["paths"]["data"], asked.paths.data
-    data = {key: new if value == old else value for key, value in stored["data"].items()}
-    return {**stored, "data": data, "paths": asked.paths.model_dump()}
+def _request(asked: EvaluateConfig) -> Request:
+    return Request(
+        split=asked.split,
+        videos=asked.videos,
+        scoring=asked.scoring,
+        pictures=asked.pictures,
+        pictures_by=asked.pictures_by,
+        export=asked.export,
+        save_interval=asked.save_interval,
+        again=asked.again,
+        accelerator=asked.accelerator,
+        folder=None if asked.folder is None else Path(asked.folder),
+        paths=asked.paths,
+    )
+
+
+def _predictions(asked: EvaluateConfig) -> Predictions:
+    assert asked.predictions is not None
+    path, scoring, usual = Path(asked.predictions), asked.scoring, ScoringPart()
+    if not path.exists():
+        raise UserError(f"predictions = {path} does not exist: give an .npz or .json file, or a folder.")
+    for key in ("min_presence", "presence_after"):
+        if getattr(scoring, key) != getattr(usual, key):
+            raise UserError(f"scoring.{key} has no effect on predictions, which hold no presence: leave it out.")
+    if scoring.tracking.drop_background_slot:
+        raise UserError(
+            "scoring.tracking.drop_background_slot has no effect on predictions, which do not say what is background: "
+            "leave it out."
+        )
+    output = Path(asked.output) if asked.output is not None else output_of(path)
+    check_output(output)
+    return Predictions(
+        path=path,
+        format=asked.format,
+        truth=None if asked.truth is None else Path(asked.truth),
+        split=asked.split,
+        partial=asked.partial,
+        resize=asked.resize,
+        output=output,
+        scoring=scoring,
+    )
 
 
 if __name__ == "__main__":

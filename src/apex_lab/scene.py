@@ -74,6 +74,9 @@ class SceneModel(nn.Module):
     needs_training: bool = True
     """False for models that have nothing to learn by gradient (the classical yardsticks)."""
 
+    tracks: bool = True
+    """False for models of single images, whose ids mean nothing from one frame to the next: no tracking scores."""
+
     needs_labels: bool = False
     """True for models that read the ground truth (the oracle): `from_labels` takes the place of `forward`."""
 

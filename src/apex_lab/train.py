@@ -178,19 +178,29 @@ def _evaluate(run: Run, model: SceneModel, data: Any, device: torch.device) -> d
     asked = config.evaluation
     schedule = schedule_at({n: s(config.trainer.max_steps) for n, s in build_schedules(config).items()}, device)
     data.setup("test")
-    batches = data.loader(asked.split, asked.videos)
-    evaluator, items = evaluation.evaluate(model, batches, schedule, device, config.trainer.precision, asked.pictures)
-    evaluation.draw(run.view_folder, items, run.curves_file)
-    stored = evaluation.store(run.folder, asked.split, evaluator, asked.model_dump())
-    total = read_json(stored)["splits"][asked.split]["total"]
-    return {f"{asked.split}/{key}": total[key] for key in evaluation.COLUMNS}
+    scored, _ = evaluation.evaluate(
+        evaluation.Asked(
+            folder=run.folder,
+            split=asked.split,
+            about={"seed": config.seed, "data_fingerprint": data.fingerprint},
+            settings=asked.model_dump(),
+            beside={"validation_foreground_share": run.record.get("foreground_share")},
+            pictures=asked.pictures,
+            view=run.view_folder,
+            curves=run.curves_file,
+        ),
+        evaluation.Predictor(model, schedule, device, config.trainer.precision),
+        data.loader(asked.split, asked.videos),
+    )
+    return {f"{asked.split}/{key}": scored["total"][key] for key in evaluation.COLUMNS}
 
 
 def _show(run: Run) -> None:
-    """The row of scores and the pictures' paths."""
+    """The rows of scores and the pictures' paths."""
     for split, scored in read_json(run.metrics_file)["splits"].items():
-        console.say(evaluation.summary(split, scored))
-    for path in sorted(run.view_folder.glob("*"), key=lambda path: (path.stem != "film_strip", path.name)):
+        console.say(evaluation.summary(split, scored["total"]))
+    pictures = [path for path in run.view_folder.glob("*") if path.is_file()]
+    for path in sorted(pictures, key=lambda path: (path.stem != "film_strip", path.name)):
         console.say(str(path))
 
 

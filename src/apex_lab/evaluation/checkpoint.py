@@ -1,0 +1,260 @@
+"""Evaluates checkpoint files: which files are meant, where their results go, what has been done before."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock, Timeout
+
+from apex_lab import checkpoints, components, config, console, provenance
+from apex_lab.errors import UserError
+from apex_lab.evaluation.export import export_path
+from apex_lab.evaluation.parts import Parts
+from apex_lab.evaluation.record import summary
+from apex_lab.evaluation.score import Predictor
+from apex_lab.evaluation.scoring import ScoringPart
+from apex_lab.evaluation.whole import Asked, evaluate
+from apex_lab.files import make_folder, read_json
+from apex_lab.metrics.evaluator import versions
+from apex_lab.scene import SceneModel, schedule_at
+from apex_lab.validation import one_line, sentence
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked for, the same for all checkpoints; fields as the keys of conf/evaluate.yaml."""
+
+    split: str
+    videos: int | None
+    scoring: ScoringPart
+    pictures: int
+    pictures_by: str
+    export: str | None
+    save_interval: int
+    again: bool
+    accelerator: str
+    folder: Path | None
+    paths: config.PathsPart
+
+
+def find(patterns: Sequence[str]) -> list[Path]:
+    """The checkpoint files that are meant, each once, in the order of the patterns.
+
+    Args:
+        patterns: checkpoint files, run folders (their last checkpoint), folders that hold run folders, or patterns
+            with `*` for any of these.
+
+    Raises:
+        UserError: one of them means no checkpoint.
+    """
+    found: dict[Path, Path] = {}
+    for pattern in patterns:
+        for path in _matches(pattern):
+            for file in _files(path):
+                found.setdefault(file.resolve(), file)
+    return list(found.values())
+
+
+def load(file: Path, paths: config.PathsPart) -> tuple[dict[str, Any], config.Job]:
+    """A checkpoint and the checked configuration that made it, with the folders of this machine.
+
+    Raises:
+        UserError: the file is no usable checkpoint.
+    """
+    content = checkpoints.load(file)
+    stored = content["config"]
+    old, new = stored["paths"]["data"], paths.data
+    data = {key: new if value == old else value for key, value in stored["data"].items()}
+    try:
+        job = config.check_job({**stored, "data": data, "paths": paths.model_dump()}, content["choices"])
+    except UserError as error:
+        raise UserError(sentence(f"{file} was made by another version of apex_lab: {one_line(error)}")) from error
+    return content, job
+
+
+def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
+    """Evaluates one checkpoint, or says that it was done before; prints rows and paths.
+
+    Args:
+        request: what is asked for.
+        file: the checkpoint.
+        alone: it is the only one, so a folder that was given is its own.
+
+    Raises:
+        UserError: the checkpoint does not fit, or another process works on it.
+    """
+    content, job = load(file, request.paths)
+    model = _model(file, content, job)
+    with open(file, "rb") as opened:
+        digest = hashlib.file_digest(opened, "sha256").hexdigest()
+    folder = make_folder(_folder(request, file, content, job, model, digest, alone))
+    lock = FileLock(str(folder / ".lock"))
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        raise UserError(f"{folder} is being worked on by another process: wait for it or stop it.") from error
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written ({error.strerror}): give another folder=.") from error
+    with lock:
+        _evaluate(request, file, content, job, model, digest, folder)
+
+
+def _evaluate(
+    request: Request,
+    file: Path,
+    content: Mapping[str, Any],
+    job: config.Job,
+    model: SceneModel,
+    digest: str,
+    folder: Path,
+) -> None:
+    device = config.device(request.accelerator)
+    data = components.build(job.config.data, "data")
+    data.prepare_data()
+    data.setup("test")
+    key = _key(request, digest, data.fingerprint, device)
+    view = folder / "view" / request.split
+    done = None if request.again else _done(folder, request, key)
+    if done is not None:
+        console.say(f"evaluated already (again=true does it once more): {folder / 'metrics.json'}")
+        pictures = sorted(view.glob("*"), key=lambda path: (path.stem != "film_strip", path.name))
+        _show(request.split, done, [folder / "metrics.json", *(pictures if done["pictures"] else [])])
+        return
+    parts = _parts(request, folder, key)
+    schedules = config.build_schedules(job.config)
+    schedule = schedule_at({name: value(content["step"]) for name, value in schedules.items()}, device)
+    asked = Asked(
+        folder=folder,
+        split=request.split,
+        about={
+            **{"seed": job.config.seed, "step": content["step"], "data_fingerprint": data.fingerprint},
+            **{"checkpoint_sha256": digest, "evaluation": key},
+        },
+        settings={"checkpoint": str(file), "split": request.split, "videos": request.videos},
+        scoring=request.scoring,
+        pictures=request.pictures,
+        pictures_by=request.pictures_by,
+        view=view,
+        curves=run_folder(file) / "curves.csv",
+        export=request.export,
+    )
+    predictor = Predictor(model, schedule, device, job.config.trainer.precision)
+    scored, paths = evaluate(asked, predictor, data.loader(request.split, request.videos), parts)
+    _show(request.split, scored, [folder / "metrics.json", *paths])
+
+
+def _show(split: str, scored: Mapping[str, Any], paths: Sequence[Path]) -> None:
+    console.say(summary(split, scored["total"]))
+    for path in paths:
+        console.say(str(path))
+
+
+def run_folder(file: Path) -> Path:
+    """The folder of the run that a checkpoint file would belong to."""
+    return Path(os.path.normpath(file.parent / ".."))
+
+
+def _folder(
+    request: Request,
+    file: Path,
+    content: Mapping[str, Any],
+    job: config.Job,
+    model: SceneModel,
+    digest: str,
+    alone: bool,
+) -> Path:
+    """Where results go.
+
+    The run's own folder takes what belongs in tables: all videos of a split, scored as by default, at the end of
+    training. Everything else has a folder of its own, so it never takes the place of that.
+    """
+    of_file = f"{file.stem}_{digest[:8]}"
+    if request.folder is not None:
+        return request.folder if alone else request.folder / of_file
+    run = run_folder(file)
+    in_run = (run / "run.json").is_file()
+    usual = request.scoring == ScoringPart()
+    ended = content["step"] >= job.config.trainer.max_steps or not model.needs_training
+    if in_run and file.name == "last.ckpt" and ended and usual and request.videos is None:
+        return run
+    words = [file.stem if in_run and ended else of_file, request.split]
+    words += [] if request.videos is None else [str(request.videos)]
+    words += [] if usual else [_digest(request.scoring.model_dump())]
+    return (run if in_run else Path(request.paths.outputs)) / "evaluate" / "_".join(words)
+
+
+def _key(request: Request, digest: str, data: str, device: torch.device) -> str:
+    """Names an evaluation: equal only if everything is equal that can change its results."""
+    own = {name: getattr(request, name) for name in ("split", "videos", "pictures", "pictures_by", "export")}
+    made_by = {"versions": versions(), "commit": provenance.commit()[0], "device": device.type}
+    return _digest({"checkpoint": digest, "data": data, "scoring": request.scoring.model_dump(), **own, **made_by}, 32)
+
+
+def _digest(content: Mapping[str, Any], digits: int = 8) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:digits]
+
+
+def _done(folder: Path, request: Request, key: str) -> dict[str, Any] | None:
+    """What is stored of this very evaluation, if it came to its end and its export is still there."""
+    file = folder / "metrics.json"
+    scored = read_json(file).get("splits", {}).get(request.split, {}) if file.exists() else {}
+    if scored.get("evaluation") != key:
+        return None
+    if request.export is not None and not export_path(folder, request.split, request.export).exists():
+        return None
+    return scored
+
+
+def _parts(request: Request, folder: Path, key: str) -> Parts:
+    """What was done before of this very evaluation; parts of others of this split are of no use and removed."""
+    own = folder / f".{request.split}_{key[:16]}"
+    for other in folder.glob(f".{request.split}_*"):
+        if request.again or other != own:
+            shutil.rmtree(other)
+    return Parts(own, request.save_interval, identities=request.export is not None)
+
+
+def _model(file: Path, content: Mapping[str, Any], job: config.Job) -> SceneModel:
+    model = config.build_model(job.config)
+    try:
+        model.load_state_dict(content["weights"])
+    except RuntimeError as error:
+        raise UserError(sentence(f"The weights in {file} do not fit its model: {one_line(error)}")) from error
+    return model
+
+
+def _matches(pattern: str) -> list[Path]:
+    path = Path(pattern)
+    if path.exists():
+        return [path]
+    if not any(mark in pattern for mark in "*?"):
+        raise UserError(f"checkpoint = {pattern} does not exist: give a .ckpt file or a run folder.")
+    start = Path(path.anchor) if path.is_absolute() else Path()
+    found = sorted(start.glob(str(path.relative_to(path.anchor))))
+    if not found:
+        raise UserError(f"checkpoint = {pattern} fits nothing: give .ckpt files or run folders.")
+    return found
+
+
+def _files(path: Path) -> list[Path]:
+    """The file itself; the last checkpoint of a run; those of all runs in a folder."""
+    if not path.is_dir():
+        return [path]
+    own = path / "checkpoints" / "last.ckpt"
+    if own.is_file():
+        return [own]
+    inside = sorted(file for file in path.rglob("last.ckpt") if file.parent.name == "checkpoints")
+    if not inside:
+        raise UserError(
+            f"checkpoint = {path} is a folder without checkpoints/last.ckpt, and no run folder is in it: "
+            "give a .ckpt file or a run folder."
+        )
+    return inside

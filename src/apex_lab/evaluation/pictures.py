@@ -1,0 +1,78 @@
+"""Pictures of the best, the median and the worst videos, made when all scores are known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torch.utils.data import default_collate
+
+from apex_lab.errors import UserError
+from apex_lab.evaluation.score import Batches, Predictor
+from apex_lab.files import make_folder
+from apex_lab.metrics import KEYS
+from apex_lab.view import Item, render_all
+from apex_lab.view.item import one_video
+
+PICTURES_BY = "ari_fg"
+"""The score that ranks videos for pictures."""
+
+
+class Chosen(NamedTuple):
+    """A video worth a picture: what it stands for, its name, its score."""
+
+    title: str
+    video: str
+    value: float
+
+
+def choose(rows: Sequence[Mapping[str, Any]], count: int, key: str = PICTURES_BY) -> list[Chosen]:
+    """The best, the worst, and evenly spaced ranks between: 3 are best, median and worst, 1 is the median.
+
+    Args:
+        rows: values per video, `video` its name; videos without a value are left out.
+        count: how many; all where there are fewer.
+        key: what ranks them, one of `apex_lab.metrics.KEYS` with a direction.
+
+    Raises:
+        UserError: no video has a value.
+    """
+    sign = -1.0 if KEYS[key].better == "up" else 1.0
+    known = sorted((sign * row[key], row["video"]) for row in rows if not math.isnan(row[key]))
+    if not known and rows and count:
+        raise UserError(f"pictures_by = '{key}' is undefined for every video of this model: choose another score.")
+    last, count = len(known) - 1, min(count, len(known))
+    ranks = [last // 2] if count == 1 else [round(i * last / (count - 1)) for i in range(count)]
+    titles = {last: "worst", 0: "best"} if count > 1 else {}
+    middle = ranks[count // 2] if count % 2 else None
+    found = []
+    for rank in ranks:
+        title = titles.get(rank, "median" if rank == middle else f"rank {rank + 1}")
+        found.append(Chosen(title, known[rank][1], sign * known[rank][0]))
+    return found
+
+
+def draw(
+    folder: Path,
+    chosen: Sequence[Chosen],
+    positions: Mapping[str, int],
+    predictor: Predictor,
+    batches: Batches,
+    curves: Path | None = None,
+) -> list[Path]:
+    """Asks the model for the chosen videos once more and draws them; the pictures' paths, the film strip first.
+
+    Pictures of an earlier evaluation in the folder are replaced.
+    """
+    if not chosen:
+        return []
+    items = []
+    for title, name, _ in chosen:
+        batch = default_collate([batches.dataset[positions[name]]])
+        scene = one_video(predictor(batch), 0)
+        items.append(Item(f"{title} {name}", batch["video"], scene, 0, batch["segmentation"]))
+    for old in make_folder(folder).glob("components_*.png"):
+        old.unlink()
+    return render_all(folder, items, curves if curves is not None and curves.is_file() else None)

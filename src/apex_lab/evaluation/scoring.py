@@ -1,0 +1,78 @@
+"""How an evaluation scores, as keys of the configuration; the defaults are those of the paper's tables."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from apex_lab.metrics import EvaluatorSettings, TrackingSettings
+from apex_lab.metrics.boundary import TOLERANCE
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class TrackingPart(_Part):
+    """The fields of `apex_lab.metrics.TrackingSettings`."""
+
+    first_frame: int = 0
+    stop_frame: int | None = None
+    min_iou: float = 0.5
+    min_pixels: int = 5
+    background_iou: float | None = 0.2
+    tracked_share: float = 0.8
+    drop_background_slot: bool = False
+
+    @model_validator(mode="after")
+    def _possible(self) -> TrackingPart:
+        TrackingSettings(**self.model_dump())
+        return self
+
+
+class ScoringPart(_Part):
+    """How videos are scored.
+
+    Attributes:
+        tracking, public_first_frame, skip_empty, boundary_tolerance: as in `apex_lab.metrics.EvaluatorSettings`.
+        identities: `own`, `none` and `linked` as there; `auto` is `own` for a model that tracks (`SceneModel.tracks`)
+            and for files of predictions, else `none`.
+        min_presence, presence_after: as in `apex_lab.metrics.scene_identities`.
+    """
+
+    tracking: TrackingPart = TrackingPart()
+    public_first_frame: int | None = 2
+    skip_empty: bool = False
+    boundary_tolerance: float = TOLERANCE
+    identities: Literal["auto", "own", "none", "linked"] = "auto"
+    min_presence: float = Field(default=0.5, ge=0, le=1)
+    presence_after: bool = False
+
+    @model_validator(mode="after")
+    def _possible(self) -> ScoringPart:
+        self.settings(True)
+        return self
+
+    def settings(self, tracks: bool, details: bool = False) -> EvaluatorSettings:
+        """What the evaluator is built with.
+
+        Args:
+            tracks: whether identities hold over time.
+            details: keep rows per frame and events.
+        """
+        return EvaluatorSettings(
+            tracking=TrackingSettings(**self.tracking.model_dump()),
+            public_first_frame=self.public_first_frame,
+            skip_empty=self.skip_empty,
+            boundary_tolerance=self.boundary_tolerance,
+            identities=("own" if tracks else "none") if self.identities == "auto" else self.identities,
+            per_frame=details,
+            events=details,
+        )
+
+    def stored(self, tracks: bool) -> dict[str, Any]:
+        """What is stored with the results."""
+        presence = {"min_presence": self.min_presence, "presence_after": self.presence_after}
+        return {**asdict(self.settings(tracks)), **presence}

@@ -1,0 +1,77 @@
+"""One whole evaluation: scores, pictures, export, record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from apex_lab.evaluation import export as exports
+from apex_lab.evaluation import pictures, record
+from apex_lab.evaluation.parts import Parts
+from apex_lab.evaluation.pictures import PICTURES_BY
+from apex_lab.evaluation.score import Batches, Predictor, score
+from apex_lab.evaluation.scoring import ScoringPart
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What an evaluation is to do.
+
+    Attributes:
+        folder: where results go.
+        split: name of what is scored.
+        about: entries to be stored with the split (checkpoint, seed, ...).
+        settings: entries to be stored among its settings.
+        beside: entries to be stored at the top of metrics.json.
+        scoring: how.
+        pictures: how many videos are drawn.
+        pictures_by: what ranks videos for that.
+        view: where pictures go.
+        curves: a table of curves to draw too.
+        export: format to write predictions in; needs parts that keep identities.
+    """
+
+    folder: Path
+    split: str
+    about: Mapping[str, Any]
+    settings: Mapping[str, Any]
+    beside: Mapping[str, Any] = field(default_factory=dict)
+    scoring: ScoringPart = field(default_factory=ScoringPart)
+    pictures: int = 3
+    pictures_by: str = PICTURES_BY
+    view: Path | None = None
+    curves: Path | None = None
+    export: str | None = None
+
+
+def evaluate(
+    asked: Asked, predictor: Predictor, batches: Batches, parts: Parts | None = None
+) -> tuple[dict[str, Any], list[Path]]:
+    """Scores, draws, exports and stores; metrics.json is written last, so it is there only when all else is.
+
+    Args:
+        asked: what to do.
+        predictor: the model.
+        batches: of the split, in order.
+        parts: where what is done is kept until all is.
+
+    Returns:
+        What metrics.json holds of the split, and the paths of exports and pictures, film strip first among those.
+    """
+    tally = score(predictor, batches, asked.split, asked.scoring, parts)
+    result = tally.evaluator.result()
+    chosen = pictures.choose(result["per_video"], asked.pictures, asked.pictures_by)
+    view = asked.view or asked.folder / "view"
+    drawn = pictures.draw(view, chosen, tally.positions, predictor, batches, asked.curves)
+    written = []
+    if asked.export is not None:
+        assert parts is not None
+        assert parts.identities
+        written = exports.write(asked.folder, asked.split, asked.export, parts, batches.dataset)
+    about = {**asked.about, "settings": {**asked.settings, "scoring": asked.scoring.stored(predictor.model.tracks)}}
+    scored = record.store(asked.folder, asked.split, tally, result, about, chosen, asked.beside)
+    if parts is not None:
+        parts.remove()
+    return scored, [*written, *drawn]
