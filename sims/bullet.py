@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from sims.errors import SimError
@@ -43,6 +45,10 @@ class Client:
     def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
         """`pybullet.<name>(*args, **kwargs)` on this server."""
         return getattr(self.module, name)(*args, physicsClientId=self.id, **kwargs)
+
+    def bound(self, name: str) -> Callable[..., Any]:
+        """`pybullet.<name>` on this server, for calls that are made very often."""
+        return partial(getattr(self.module, name), physicsClientId=self.id)
 
     def close(self) -> None:
         """Disconnect; safe to call twice."""

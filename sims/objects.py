@@ -35,7 +35,7 @@ class Entry:
     mass_kg: float | None
     projection: Projection
     rests: tuple[Rest, ...]
-    faces: int = 600
+    faces: int = 500
     convex: bool = True
 
 
@@ -47,11 +47,11 @@ CATALOGUE: tuple[Entry, ...] = (
     Entry("mustard_bottle", "006_mustard_bottle", 0.603, "can", (UPRIGHT, ON_BACK)),
     Entry("pudding_box", "008_pudding_box", 0.187, "box", (UPRIGHT, ON_BACK, ON_SIDE), faces=300),
     Entry("potted_meat_can", "010_potted_meat_can", 0.370, "box", (UPRIGHT, ON_BACK)),
-    Entry("banana", "011_banana", 0.066, "length", (UPRIGHT,), faces=500, convex=False),
+    Entry("banana", "011_banana", 0.066, "length", (UPRIGHT,), faces=450, convex=False),
     Entry("apple", "013_apple", 0.068, "round", (UPRIGHT,)),
     Entry("pear", "016_pear", 0.049, "length", (UPRIGHT,)),
     Entry("orange", "017_orange", 0.047, "round", (UPRIGHT,)),
     Entry("bleach_cleanser", "021_bleach_cleanser", 1.131, "can", (UPRIGHT, ON_BACK)),
-    Entry("mug", "025_mug", 0.118, "can", (UPRIGHT, UPSIDE_DOWN, ON_BACK), faces=700, convex=False),
+    Entry("mug", "025_mug", 0.118, "can", (UPRIGHT, UPSIDE_DOWN, ON_BACK), faces=600, convex=False),
     Entry("foam_brick", "061_foam_brick", 0.028, "box", (UPRIGHT, ON_BACK, ON_SIDE), faces=300),
 )

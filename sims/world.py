@@ -22,6 +22,10 @@ class World:
 
     def __init__(self) -> None:
         self.bullet = Client()
+        # What is called at every step is looked up once.
+        self._step, self._set_motors, self._contact_points = (
+            self.bullet.bound(name) for name in ("stepSimulation", "setJointMotorControlArray", "getContactPoints")
+        )
         self.arm_urdf = str(panda.arm_model().physics)
         self.arm = -1
         self.table = -1
@@ -74,8 +78,7 @@ class World:
 
     def drive(self, positions: list[float], speeds: list[float]) -> None:
         """Set the motors' targets: (9,) joint angles and finger positions, and their speeds."""
-        self.bullet.call(
-            "setJointMotorControlArray",
+        self._set_motors(
             self.arm,
             panda.JOINTS,
             self.bullet.module.POSITION_CONTROL,
@@ -88,7 +91,7 @@ class World:
 
     def step(self) -> None:
         """Advance by 1 / `STEPS_PER_S` seconds."""
-        self.bullet.call("stepSimulation")
+        self._step()
 
     def poses(self) -> np.ndarray:
         """(O, 7) x, y, z in metres and quaternion x, y, z, w of every object's frame."""
@@ -116,15 +119,15 @@ class World:
 
     def contacts(self) -> tuple[list[int], list[tuple[int, int]]]:
         """Who touches whom now: numbers of the objects that the arm touches, and pairs of touching objects."""
-        call, objects = self.bullet.call, self.objects
+        contact_points, objects = self._contact_points, self.objects
         number = {body: i for i, body in enumerate(objects)}
         with_arm: set[int] = set()
         if self.arm >= 0:
-            with_arm = {point[2] for point in call("getContactPoints", self.arm) if point[8] <= TOUCH_M}
+            with_arm = {point[2] for point in contact_points(self.arm) if point[8] <= TOUCH_M}
         pairs = []
         for i, body in enumerate(objects):
             for j in range(i + 1, len(objects)):
-                points = call("getContactPoints", body, objects[j])
+                points = contact_points(body, objects[j])
                 if any(point[8] <= TOUCH_M for point in points):
                     pairs.append((i, j))
         return sorted(number[body] for body in with_arm if body in number), pairs

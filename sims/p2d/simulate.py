@@ -14,7 +14,7 @@ from sims.assets import ObjectModel, object_models
 from sims.background import TABLE_HIGH_M, TABLE_LOW_M
 from sims.errors import SimError
 from sims.p2d.settings import Settings
-from sims.p2d.spec import NoRoom, Spec, sample
+from sims.p2d.spec import SEEN, NoRoom, Spec, sample
 from sims.p2d.trajectory import Trajectory
 from sims.poses import moved
 from sims.render import Renderer
@@ -31,8 +31,6 @@ REACH_ERROR_M = 0.001
 START_GAP_M = 0.01
 IN_PICTURE = 0.9
 """Least share of an object's vertices within the picture's border, in every frame."""
-SEEN = 0.4
-"""Every object shows at least this share of itself in at least one frame."""
 STILL_M, STILL_RAD = 1e-4, 1e-3
 """An object that moved less than this since its last recorded pose keeps that pose: what rests is exactly at rest."""
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sims.assets import ObjectModel, object_models
 from sims.errors import SimError
+from sims.outlines import cover
 from sims.p2d.settings import Settings
 
 MARGIN_M = 0.015
@@ -26,6 +27,9 @@ RUN_ON_M = (0.06, 0.16)
 """How far before and behind the middle of its target an aimed line starts and ends."""
 BORDER = 0.015
 """Least distance of an object from the picture's border, as a share of its side."""
+SEEN = 0.4
+"""Every object shows at least this share of itself in at least one frame."""
+OUTLINE_PX = 64
 DROP_M = 0.0005
 TRIES = 20
 SAME_CLASSES = 5
@@ -130,7 +134,19 @@ def _place(
                 break
         else:
             return None
-    return placed
+    return None if _some_hidden(settings, placed) else placed
+
+
+def _some_hidden(settings: Settings, placed: list[_Placed]) -> bool:
+    """Whether an object shows less than `SEEN` of its outline beside those nearer to the camera."""
+    nearest_first = sorted(placed, key=lambda each: settings.camera.project(each.points, 1)[1].mean())
+    taken = np.zeros((OUTLINE_PX, OUTLINE_PX), dtype=bool)
+    for each in nearest_first:
+        reach, _ = cover(settings.camera, OUTLINE_PX, each.points)
+        if np.count_nonzero(reach & ~taken) < SEEN * np.count_nonzero(reach):
+            return True
+        taken |= reach
+    return False
 
 
 def _put(settings: Settings, model: ObjectModel, class_index: int, rng: np.random.Generator) -> _Placed | None:

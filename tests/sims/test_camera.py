@@ -20,7 +20,7 @@ def test_target_lies_in_the_middle_at_its_distance() -> None:
 def test_up_is_up_and_right_is_right() -> None:
     forward = np.subtract(CAMERA.target, CAMERA.eye)
     right = np.cross(forward, [0, 0, 1])
-    above, _ = CAMERA.project(np.array(CAMERA.target) + [0, 0, 0.05], 100)
+    above, _ = CAMERA.project(np.array(CAMERA.target) + np.array([0, 0, 0.05]), 100)
     aside, _ = CAMERA.project(np.array(CAMERA.target) + 0.05 * right / np.linalg.norm(right), 100)
     assert above[1] < 50
     assert above[0] == pytest.approx(50)

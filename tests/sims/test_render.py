@@ -173,7 +173,7 @@ def test_tiny_renderer_and_ray_caster_agree_on_the_table() -> None:
 
 def test_shadows_lie_on_the_table_away_from_the_light() -> None:
     camera = Camera()
-    body = trimesh.creation.box((0.06, 0.06, 0.06)).vertices + [0.52, 0.0, 0.03]
+    body = trimesh.creation.box((0.06, 0.06, 0.06)).vertices + np.array([0.52, 0.0, 0.03])
     light = np.array([1.0, 0.0, 1.0])
     dark = outlines.shadows(camera, 128, [np.asarray(body)], light) / 255.0
     points = background(camera, 128).points
@@ -230,7 +230,6 @@ def test_egl_draws_the_same_scene_where_it_can(
     try:
         load_egl(probe)
     except SimError as error:
-        assert "renderer=tiny" in str(error)
         pytest.skip(str(error))
     finally:
         probe.close()

@@ -48,7 +48,7 @@ def test_bytes_depend_on_no_order(trajectories: dict[int, Trajectory]) -> None:
 
 def test_bytes_depend_on_no_process(trajectories: dict[int, Trajectory]) -> None:
     code = (
-        "from sims.p2d.settings import Settings; from sims.p2d.simulate import simulate; import sys, dataclasses, hashlib;"
+        "from sims.p2d.settings import Settings; from sims.p2d.simulate import simulate; import dataclasses, hashlib;"
         "import numpy as np; t = simulate(Settings(frames=4, image_size=64), 'train', 5); h = hashlib.sha256();"
         "[h.update(np.asarray(getattr(t, f.name)).tobytes()) for f in dataclasses.fields(t)]; print(h.hexdigest())"
     )

@@ -89,6 +89,6 @@ def test_separate_polygons() -> None:
     square = rectangle(np.zeros(2), (0.2, 0.2), 0.0)
     turned = rectangle(np.array([0.24, 0.0]), (0.2, 0.2), np.pi / 4)
     assert not separate(square, turned, 0.0)  # 0.24 - 0.1 - 0.1 * sqrt(2) < 0
-    assert separate(square, turned + [0.02, 0.0], 0.0)
-    assert not separate(square, turned + [0.02, 0.0], 0.02)
+    assert separate(square, turned + np.array([0.02, 0.0]), 0.0)
+    assert not separate(square, turned + np.array([0.02, 0.0]), 0.02)
     np.testing.assert_allclose(rectangle(np.array([1.0, 2.0]), (0.4, 0.2), np.pi / 2)[0], [0.9, 2.2])
