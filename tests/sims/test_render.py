@@ -248,3 +248,20 @@ def test_a_missing_egl_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(SimError, match="use renderer=tiny"):
         Stage("egl", None)
+
+
+def test_the_few_faced_arm_looks_like_the_arm(joints: np.ndarray) -> None:
+    """Against PyBullet's own meshes at P2D's size: the same silhouette, the same colours but for a few pixels."""
+    model = panda.arm_model()
+    pictures = []
+    for urdf in (model.visual, model.original):
+        stage = Stage("tiny", replace(model, visual=urdf))
+        stage.pose_joints(joints)
+        pictures.append(stage.draw(Camera(), 128))
+        stage.close()
+    (rgb, _, ids), (original_rgb, _, original_ids) = pictures
+    both = (ids > 0) & (original_ids > 0)
+    assert np.count_nonzero(both) / np.count_nonzero((ids > 0) | (original_ids > 0)) > 0.95
+    difference = np.abs(rgb[both].astype(int) - original_rgb[both]).max(axis=-1)
+    assert np.median(difference) < 12
+    assert (difference > 80).mean() < 0.06
