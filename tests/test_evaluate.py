@@ -1,3 +1,5 @@
+"""The command itself; what it does is tested in tests/evaluation."""
+
 from __future__ import annotations
 
 import json
@@ -7,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.conftest import Ended
+from tests.conftest import REPOSITORY, Ended
 
 
 @pytest.fixture
@@ -17,27 +19,22 @@ def trained(train: Callable[..., Ended], the_run: Callable[..., Path]) -> Path:
 
 
 def test_a_run_scores_again_as_at_its_end(trained: Path, command: Callable[..., Ended]) -> None:
-    ended = command("evaluate", f"checkpoint={trained}", "pictures=1")
+    before = json.loads((trained / "metrics.json").read_text())
+    ended = command("evaluate", f"checkpoint={trained}")
     assert ended.code == 0
-    folder = trained / "evaluate" / "last_test"
-    again, before = (json.loads((path / "metrics.json").read_text()) for path in (folder, trained))
-    assert again["splits"] == before["splits"]
-    lines = ended.out.splitlines()
-    assert lines[1].split() == ["ARI-FG", "MSC-FG", "ARI", "MSC"]
-    paths = [Path(line) for line in lines[3:]]
-    assert paths[0] == folder / "metrics.json"
-    assert paths[1] == folder / "view" / "film_strip.png"
+    again = json.loads((trained / "metrics.json").read_text())
+    for key in ("total", "per_video", "hota_alpha", "by_property", "foreground_share", "seed", "versions"):
+        assert again["splits"]["test"][key] == before["splits"]["test"][key], key
+    assert again["splits"]["test"]["settings"]["scoring"] == before["splits"]["test"]["settings"]["scoring"]
+    share = json.loads((trained / "run.json").read_text())["foreground_share"]
+    assert before["validation_foreground_share"] == again["validation_foreground_share"] == share
+    paths = [Path(line) for line in ended.out.splitlines()[5:]]
+    view = trained / "view" / "test"
+    assert paths[:2] == [trained / "metrics.json", view / "film_strip.png"]
+    assert {path.name for path in view.glob("best_*")} == set()
+    assert [path.name.split("_test_")[0] for path in paths[4:6]] == ["components_best", "components_worst"]
+    assert paths[6] == view / "curves.png"
     assert all(path.is_file() for path in paths)
-
-
-def test_split_videos_and_folder_are_chosen(trained: Path, command: Callable[..., Ended], tmp_path: Path) -> None:
-    words = ("split=val", "videos=1", "pictures=0", "folder=elsewhere")
-    ended = command("evaluate", f"checkpoint={trained}/checkpoints/best.ckpt", *words)
-    assert ended.code == 0
-    stored = json.loads((tmp_path / "elsewhere" / "metrics.json").read_text())
-    assert (stored["splits"]["val"]["videos"], stored["splits"]["val"]["frames"]) == (1, 3)
-    assert stored["settings"]["split"] == "val"
-    assert "scoring" in stored["settings"]
 
 
 def test_a_checkpoint_alone_is_enough(trained: Path, command: Callable[..., Ended], tmp_path: Path) -> None:
@@ -45,38 +42,9 @@ def test_a_checkpoint_alone_is_enough(trained: Path, command: Callable[..., Ende
     alone.write_bytes((trained / "checkpoints" / "last.ckpt").read_bytes())
     ended = command("evaluate", "checkpoint=shipped.ckpt", "pictures=0", f"paths.data={tmp_path / 'data'}")
     assert ended.code == 0
-    assert (tmp_path / "outputs" / "evaluate" / "shipped_test" / "metrics.json").is_file()
-
-
-def refused(ended: Ended, told: str) -> None:
-    assert ended.code == 2
-    assert told in ended.err
-    assert len(ended.err.splitlines()) == 1
-
-
-def test_what_cannot_be_evaluated_is_told(trained: Path, command: Callable[..., Ended], tmp_path: Path) -> None:
-    (tmp_path / "text.ckpt").write_text("text")
-    torch.save({"a": 1}, tmp_path / "other.ckpt")
-    group = trained.parent.relative_to(tmp_path)
-    for word, told in {
-        "checkpoint=nowhere.ckpt": "checkpoint = nowhere.ckpt does not exist: give a .ckpt file or a run folder.",
-        "checkpoint=text.ckpt": "text.ckpt is no checkpoint, or its end is missing",
-        "checkpoint=other.ckpt": "other.ckpt is no apex_lab checkpoint",
-        f"checkpoint={group}": f"checkpoint = {group} is a folder without checkpoints/last.ckpt; it holds seed_0",
-        "checkpiont=x": "Unknown key checkpiont = 'x'; did you mean 'checkpoint'?",
-        "split=val": "checkpoint is missing: write checkpoint=...",
-        "++nothing=1": "Unknown key nothing = 1.",
-    }.items():
-        refused(command("evaluate", word), told)
-    words = [f"checkpoint={trained}"]
-    refused(
-        command("evaluate", *words, "split=tst"), "split = 'tst' is wrong: input should be 'train', 'val' or 'test'."
-    )
-    refused(command("evaluate", *words, "videos=0"), "videos = 0 is wrong")
-
-
-def test_weights_of_another_model_are_refused(trained: Path, command: Callable[..., Ended], tmp_path: Path) -> None:
-    content = torch.load(trained / "checkpoints" / "last.ckpt", weights_only=True)
+    assert len(list((tmp_path / "outputs" / "evaluate").glob("shipped_*_test/metrics.json"))) == 1
+    # weights of another model, a configuration of another version, files that are no checkpoints
+    content = torch.load(alone, weights_only=True)
     content["config"]["model"]["width"] = 5
     torch.save(content, tmp_path / "other.ckpt")
     ended = command("evaluate", "checkpoint=other.ckpt")
@@ -85,3 +53,33 @@ def test_weights_of_another_model_are_refused(trained: Path, command: Callable[.
     content["config"]["model"]["depth"] = 5
     torch.save(content, tmp_path / "other.ckpt")
     refused(command("evaluate", "checkpoint=other.ckpt"), "was made by another version of apex_lab: Unknown key")
+
+
+def test_predictions_of_another_program(command: Callable[..., Ended]) -> None:
+    public = REPOSITORY / "tests" / "metrics" / "fixtures" / "metrics_public.npz"
+    ended = command("evaluate", f"predictions={public}", "output=scores.json")
+    assert ended.code == 0
+    assert json.loads(Path("scores.json").read_text())["total"]["videos"] == 8
+
+
+def refused(ended: Ended, told: str) -> None:
+    assert ended.code == 2
+    assert told in ended.err
+    assert len(ended.err.splitlines()) == 1
+
+
+def test_what_cannot_be_evaluated_is_told(command: Callable[..., Ended], tmp_path: Path) -> None:
+    (tmp_path / "text.ckpt").write_text("text")
+    torch.save({"a": 1}, tmp_path / "other.ckpt")
+    for word, told in {
+        "checkpoint=nowhere.ckpt": "checkpoint = nowhere.ckpt does not exist: give a .ckpt file or a run folder.",
+        "checkpoint=text.ckpt": "text.ckpt is no checkpoint, or its end is missing",
+        "checkpoint=other.ckpt": "other.ckpt is no apex_lab checkpoint",
+        "checkpoint=[]": "checkpoint = [] names no file",
+        "checkpiont=x": "Unknown key checkpiont = 'x'; did you mean 'checkpoint'?",
+        "split=val": "checkpoint is missing: write checkpoint=... or, for another program's, predictions=...",
+        "split=tst": "split = 'tst' is wrong: input should be 'train', 'val' or 'test'.",
+        "videos=0": "videos = 0 is wrong",
+        "++nothing=1": "Unknown key nothing = 1.",
+    }.items():
+        refused(command("evaluate", word), told)

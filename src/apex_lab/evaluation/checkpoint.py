@@ -125,8 +125,9 @@ def _evaluate(
     done = None if request.again else _done(folder, request, key)
     if done is not None:
         console.say(f"evaluated already (again=true does it once more): {folder / 'metrics.json'}")
-        pictures = sorted(view.glob("*"), key=lambda path: (path.stem != "film_strip", path.name))
-        _show(request.split, done, [folder / "metrics.json", *(pictures if done["pictures"] else [])])
+        pictures = sorted(view.glob("*"), key=_film_strip_first) if done["pictures"] else []
+        exported = [export_path(folder, request.split, request.export)] if request.export is not None else []
+        _show(request.split, done, [folder / "metrics.json", *exported, *pictures])
         return
     parts = _parts(request, folder, key)
     schedules = config.build_schedules(job.config)
@@ -155,6 +156,10 @@ def _show(split: str, scored: Mapping[str, Any], paths: Sequence[Path]) -> None:
     console.say(summary(split, scored["total"]))
     for path in paths:
         console.say(str(path))
+
+
+def _film_strip_first(path: Path) -> tuple[bool, str]:
+    return path.stem != "film_strip", path.name
 
 
 def run_folder(file: Path) -> Path:

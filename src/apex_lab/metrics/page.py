@@ -1,0 +1,30 @@
+"""`python -m apex_lab.metrics.page > docs/metrics.md`: the page that says what every number means."""
+
+from __future__ import annotations
+
+from apex_lab.metrics.keys import KEYS
+
+_HEAD = """# The numbers of an evaluation
+
+Made by `python -m apex_lab.metrics.page > docs/metrics.md` from `apex_lab/metrics/keys.py`.
+
+`python -m apex_lab.evaluate checkpoint=...` stores them in `metrics.json` under `splits.<split>.total` and
+`splits.<split>.per_video`; `python -m apex_lab.evaluate predictions=...` in `<name>.metrics.json` under `total`,
+`per_video` and `per_frame`. What is undefined (a mean over nothing, tracking of a model without identities) is `null`.
+`settings` says how they were scored, `hota_alpha` holds HOTA per threshold, and `by_property` says where the model
+fails: mean results of true objects alike in class, size, occlusion or contact. Scores of a model of this repository
+come with `foreground_share`, the mean share of pixels that it gives to objects and not to its background.
+"""
+
+
+def page() -> str:
+    """A Markdown table of all keys of an evaluation with default settings."""
+    lines = [_HEAD, "| key | meaning | range | better | given per |", "|---|---|---|---|---|"]
+    for name, key in KEYS.items():
+        levels = ", ".join("data set" if level == "total" else level for level in key.levels)
+        lines.append(f"| `{name}` | {key.meaning} | {key.range} | {key.better or '–'} | {levels} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    print(page(), end="")

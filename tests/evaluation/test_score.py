@@ -1,0 +1,150 @@
+"""Scoring, ranking and printing, each alone."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import pickle
+import weakref
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from jaxtyping import Float
+from torch import Tensor
+from torch.utils.data import DataLoader, Subset
+
+from apex_lab.errors import UserError
+from apex_lab.evaluation import Parts, Predictor, ScoringPart, Tally, score, summary
+from apex_lab.evaluation.pictures import choose
+from apex_lab.metrics import EvaluatorSettings
+from apex_lab.metrics.page import page
+from apex_lab.scene import Scene, Schedule
+from tests.conftest import REPOSITORY
+from tests.tiny import Layers, Squares
+
+CPU = torch.device("cpu")
+
+
+class Watched(Layers):
+    """Knows how many of its answers are still in memory."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.answers: list[weakref.ref[Scene]] = []
+        self.alive: list[int] = []
+
+    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
+        self.alive.append(sum(answer() is not None for answer in self.answers))
+        scene = super().forward(video, schedule)
+        self.answers.append(weakref.ref(scene))
+        return scene
+
+
+def test_memory_does_not_grow_with_videos() -> None:
+    model = Watched()
+    loader = DataLoader(Squares(24, 3, 32, 0), batch_size=2)
+    tally = score(Predictor(model, {}, CPU), loader, "test", ScoringPart())
+    assert len(tally) == 24
+    assert max(model.alive) <= 1
+    assert not tally.identities
+    assert len(pickle.dumps(tally)) / 24 < 10_000
+
+
+def test_batch_size_and_order_change_no_digit() -> None:
+    predictor = Predictor(Layers(), {}, CPU)
+    data = Squares(6, 3, 32, 0)
+    mixed = DataLoader(Subset(data, [3, 1, 5, 0, 4, 2]), batch_size=4)
+    found = [
+        score(predictor, loader, "test", ScoringPart()).evaluator.result()
+        for loader in (DataLoader(data, batch_size=1), mixed)
+    ]
+    assert found[0]["total"] == pytest.approx(found[1]["total"], rel=1e-12, nan_ok=True)
+    assert [row["video"] for row in found[0]["per_video"]] == [row["video"] for row in found[1]["per_video"]]
+
+
+class Labelled(Squares):
+    """Squares with the labels of P2D: one object in slot 0, touched by the arm in frame 1."""
+
+    def meta(self, index: int) -> dict[str, Any]:
+        contact = np.zeros((3, 1), dtype=bool)
+        contact[1] = True
+        pixels = np.array([[0, 64]] * 3)
+        return {
+            "names": ["mug"],
+            "classes": np.array([4]),
+            "visible_px": pixels,
+            "amodal_px": pixels * 2,
+            "arm_contact": contact,
+            "object_contact": np.zeros((3, 1, 1), dtype=bool),
+        }
+
+
+def test_what_the_data_set_knows_of_objects_is_in_the_table() -> None:
+    loader = DataLoader(Subset(Labelled(3, 3, 32, 0), range(2)), batch_size=2)
+    table = score(Predictor(Layers(), {}, CPU), loader, "val", ScoringPart()).evaluator.result()["per_object"]
+    assert table["video"].tolist() == ["val_00000", "val_00001"]
+    assert table["class"].tolist() == ["mug"] * 2
+    assert table["occlusion"].tolist() == [0.5] * 2
+    assert table["contact"].tolist() == pytest.approx([1 / 3] * 2)
+
+
+class Nameless(Layers):
+    """Gives no identity to any component."""
+
+    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
+        scene = super().forward(video, schedule)
+        return dataclasses.replace(scene, ids=torch.full_like(scene.ids, -1))
+
+
+def test_a_model_s_malformed_output_is_refused_by_name() -> None:
+    with pytest.raises(UserError, match=r"The model's output for val_00000, val_00001 cannot be scored: 100.00% of"):
+        score(Predictor(Nameless(), {}, CPU), DataLoader(Squares(2, 3, 32, 0), batch_size=2), "val", ScoringPart())
+
+
+def test_damaged_parts_are_told(tmp_path: Path) -> None:
+    parts = Parts(tmp_path / "parts", 2)
+    parts.save(Tally.empty(EvaluatorSettings()))
+    assert len(list(parts)) == 1
+    (tmp_path / "parts" / "000000.pickle").write_bytes(b"nothing")
+    with pytest.raises(UserError, match=r"000000.pickle is damaged .* remove .*parts and run the command again"):
+        list(parts)
+    parts.remove()
+    assert not (tmp_path / "parts").exists()
+
+
+def test_videos_are_ranked() -> None:
+    rows = [{"video": f"v{i}", "ari": value, "fps": 10 * value} for i, value in enumerate((0.5, 0.1, 0.9, 0.7, 0.3))]
+    rows.append({"video": "undefined", "ari": math.nan, "fps": math.nan})
+    assert [(c.title, c.video) for c in choose(rows, 3, "ari")] == [("best", "v2"), ("median", "v0"), ("worst", "v1")]
+    assert [(c.title, c.video, c.value) for c in choose(rows, 2, "fps")] == [("best", "v1", 1), ("worst", "v2", 9)]
+    assert [(c.title, c.video) for c in choose(rows, 1, "ari")] == [("median", "v0")]
+    titles = [c.title for c in choose(rows, 9, "ari")]
+    assert titles == ["best", "rank 2", "median", "rank 4", "worst"]
+    assert choose(rows, 0, "ari") == []
+    assert choose([], 3, "ari") == []
+
+
+def test_rows_for_the_terminal() -> None:
+    total = {"videos": 2, "frames": 6, "ari_fg": -0.0001, "msc_fg": 0.25, "ari": 1.0, "msc": None}
+    lines = summary("val", total).splitlines()
+    assert lines[0] == "val: 2 videos, 6 frames"
+    assert lines[2].split() == ["0.000", "0.250", "1.000", "n/a"]
+    assert len(lines) == 3
+    tracked = {**total, "mota": -48.64, "motp": None, "match": 25.7}
+    assert summary("val", tracked).splitlines()[4].split()[:3] == ["-48.6", "n/a", "25.7"]
+
+
+def test_the_file_s_scoring_is_that_of_training() -> None:
+    stored = yaml.safe_load((REPOSITORY / "conf" / "evaluate.yaml").read_text())["scoring"]
+    assert ScoringPart.model_validate(stored) == ScoringPart()
+    assert ScoringPart().settings(tracks=True) == EvaluatorSettings()
+    assert ScoringPart().settings(tracks=False) == EvaluatorSettings(identities="none")
+
+
+def test_the_page_of_keys_is_current() -> None:
+    told = "run `python -m apex_lab.metrics.page > docs/metrics.md`"
+    assert (REPOSITORY / "docs" / "metrics.md").read_text() == page(), told
