@@ -1,0 +1,8 @@
+"""`python -m apex_lab.tables`."""
+
+from __future__ import annotations
+
+from apex_lab.tables.command import main
+
+if __name__ == "__main__":
+    main()

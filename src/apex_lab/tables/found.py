@@ -1,0 +1,269 @@
+"""What run folders hold: every seed with its state and scores, and a sentence for every file that cannot be read."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from apex_lab.errors import UserError
+from apex_lab.files import read_json
+from apex_lab.metrics import KEYS
+from apex_lab.validation import sentence, shown, validate
+
+MIN_SHARE, MAX_SHARE = 0.001, 0.999
+"""A seed has failed whose objects are given less or more of the validation pixels (metrics.md section 3)."""
+
+DIVERGED = re.compile(r"\(not finite: ")
+"""How the learner's message is known that a loss was not finite."""
+
+SPLIT = "test"
+"""What tables are made from."""
+
+State = Literal["finished", "unfinished", "diverged", "damaged"]
+
+
+class Record(BaseModel):
+    """The entries of run.json that tables need."""
+
+    model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
+
+    status: Literal["running", "finished", "failed"]
+    model: str | None
+    ablation: str | None = None
+    data: str | None
+    scale: str | None
+    experiment: str | None = None
+    seed: int
+    reason: str | None = None
+    started: str | None = None
+    overrides: tuple[str, ...] = ()
+    fingerprint: str | None = None
+    data_fingerprint: str | None = None
+    commit: str | None = None
+    foreground_share: float | None = None
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What must be equal for two scores to be compared: the videos, and how they were scored."""
+
+    data_fingerprint: str | None
+    videos: int | None
+    frames: int | None
+    scoring: str
+
+
+@dataclass(frozen=True)
+class SeedRun:
+    """One run folder.
+
+    Attributes:
+        folder: outputs/<group>/seed_<n>.
+        seed: n.
+        record: content of run.json; None where it cannot be read.
+        state: finished with scores; unfinished; diverged (training ended with a loss that was not finite); damaged.
+        why: what is to be said of a run that has not finished.
+        scores: key of `apex_lab.metrics.KEYS` -> value on the test split, NaN where undefined.
+        protocol: of the scores.
+        share: mean share of validation pixels given to objects at the end of training; None where it is not known.
+    """
+
+    folder: Path
+    seed: int
+    record: Record | None
+    state: State
+    why: str | None = None
+    scores: Mapping[str, float] = field(default_factory=dict)
+    protocol: Protocol | None = None
+    share: float | None = None
+
+    @property
+    def group(self) -> str:
+        """Name of the configuration's folder."""
+        return self.folder.parent.name
+
+    @property
+    def words(self) -> str | None:
+        """model[_ablation]_data_scale, from run.json, else from the folder's name; None where neither says it."""
+        if self.record is None:
+            named = re.fullmatch(r"(.+)_[0-9a-f]{8}", self.group)
+            return named.group(1) if named else None
+        record = self.record
+        return run_words(record.model, record.ablation, record.data, record.scale)
+
+    @property
+    def failure(self) -> str | None:
+        """Why this seed has failed by the rule of metrics.md section 3, which sees validation data alone; else None."""
+        if self.state == "diverged":
+            return "its loss was not finite"
+        if self.share is not None and not MIN_SHARE <= self.share <= MAX_SHARE:
+            return f"it gives {100 * self.share:.3f} % of the validation pixels to objects"
+        return None
+
+
+def run_words(model: str | None, ablation: str | None, data: str | None, scale: str | None) -> str:
+    """What the folder of a run is named by."""
+    return "_".join(word for word in (model, ablation, data, scale) if word)
+
+
+def collect(outputs: Path) -> list[SeedRun]:
+    """Every run in a folder, in the order of their names; none where the folder does not exist.
+
+    Raises:
+        UserError: the folder cannot be listed.
+    """
+    if not outputs.exists():
+        return []
+    try:
+        groups = sorted(path for path in outputs.iterdir() if path.is_dir())
+        folders = [(int(p.name[5:]), p) for g in groups for p in g.glob("seed_*") if _is_seed(p)]
+    except OSError as error:
+        raise UserError(
+            f"paths.outputs = {outputs} cannot be read ({error.strerror}): give a folder of runs."
+        ) from error
+    return [read_run(path, seed) for seed, path in sorted(folders, key=lambda pair: (pair[1].parent, pair[0]))]
+
+
+def _is_seed(path: Path) -> bool:
+    return re.fullmatch(r"seed_(0|[1-9]\d*)", path.name) is not None and path.is_dir()
+
+
+def read_run(folder: Path, seed: int) -> SeedRun:
+    """Reads one run folder; damage becomes a state, never an exception."""
+    try:
+        record = _record(folder / "run.json", seed)
+    except UserError as error:
+        return SeedRun(folder, seed, None, "damaged", str(error))
+    if record.status != "finished":
+        diverged = record.status == "failed" and DIVERGED.search(record.reason or "") is not None
+        why = f"its last word is: {sentence(record.reason)}" if record.reason else f"its status is '{record.status}'."
+        return SeedRun(folder, seed, record, "diverged" if diverged else "unfinished", why)
+    try:
+        return _finished(folder, record)
+    except UserError as error:
+        return SeedRun(folder, seed, record, "damaged", str(error))
+
+
+def read_arrangement(run: SeedRun) -> dict[str, list[list[float]]] | None:
+    """The results of the arrangement task of one run; None where it has none.
+
+    arrangement.json holds, under `distances_m`, for each number of objects ("2", "3", "4") a list of scenarios, and for
+    each scenario the distance of every object to its goal in metres at the end; an object that fell off the table
+    counts as 1 (Section Object Arrangement Task), one that cannot be measured is null.
+
+    Returns:
+        Number of objects -> scenarios -> the distance of every object, NaN for null.
+
+    Raises:
+        UserError: the file is damaged.
+    """
+    file = run.folder / "arrangement.json"
+    if not file.exists():
+        return None
+    tasks = read_json(file).get("distances_m")
+    if not isinstance(tasks, dict):
+        raise UserError(f"{file} has no 'distances_m': remove it and arrange again.")
+    found: dict[str, list[list[float]]] = {}
+    for objects, scenarios in tasks.items():
+        if not objects.isdecimal() or not isinstance(scenarios, list):
+            raise UserError(
+                f"{file}: distances_m.{objects} is wrong: a list of scenarios per number of objects is wanted."
+            )
+        found[objects] = []
+        for number, scenario in enumerate(scenarios):
+            if not isinstance(scenario, list) or len(scenario) != int(objects):
+                raise UserError(f"{file}: scenario {number} of distances_m.{objects} needs {objects} distances.")
+            found[objects].append([_number(value, file, f"distances_m.{objects}") for value in scenario])
+    return found
+
+
+def _record(file: Path, seed: int) -> Record:
+    if not file.is_file():
+        raise UserError(f"{file} is missing: run the command of this run again.")
+    content = read_json(file)
+    try:
+        record = validate(Record, content, "")
+    except UserError as error:
+        raise UserError(f"{file}: {error}") from error
+    assert isinstance(record, Record)
+    if record.seed != seed:
+        raise UserError(
+            f"{file} is of seed {record.seed}, but its folder is {file.parent.name}: mend the folder's name."
+        )
+    return record
+
+
+def _finished(folder: Path, record: Record) -> SeedRun:
+    """A run with the test split's scores in total.
+
+    The share of pixels given to objects is that of the last validation of training, else that of an evaluation of the
+    whole validation split.
+    """
+    file = folder / "metrics.json"
+    if not file.is_file():
+        raise UserError(f"{file} is missing: run the command of this run again.")
+    content = read_json(file)
+    splits = content.get("splits")
+    if not isinstance(splits, dict) or not splits:
+        raise UserError(f"{file} has no 'splits': remove it and run the same command again.")
+    scored = splits.get(SPLIT)
+    if not isinstance(scored, dict):
+        raise UserError(
+            f"{file} has no scores of the split '{SPLIT}' (it has {', '.join(splits)}): evaluate that split."
+        )
+    total = scored.get("total")
+    if not isinstance(total, dict):
+        raise UserError(f"{file} has no 'splits.{SPLIT}.total': remove it and run the same command again.")
+    scores = {key: _number(total[key], file, f"splits.{SPLIT}.total.{key}") for key in KEYS if key in total}
+    videos, frames = (_size(scored.get(key, total.get(key)), file, key) for key in ("videos", "frames"))
+    data = scored.get("data_fingerprint", record.data_fingerprint)
+    protocol = Protocol(None if data is None else str(data), videos, frames, _scoring(scored, content))
+    share = record.foreground_share
+    validation = splits.get("val")
+    if share is None and isinstance(validation, dict):
+        share = _number(validation.get("foreground_share"), file, "splits.val.foreground_share")
+    known = share is not None and math.isfinite(share)
+    return SeedRun(folder, record.seed, record, "finished", None, scores, protocol, share if known else None)
+
+
+def _scoring(scored: Mapping[str, Any], content: Mapping[str, Any]) -> str:
+    """How a split was scored, in one line; models with and without identities of their own are scored alike."""
+    settings = scored.get("settings", content.get("settings"))
+    scoring = settings.get("scoring") if isinstance(settings, dict) else None
+    if isinstance(scoring, dict) and scoring.get("identities") in ("own", "none"):
+        scoring = {key: value for key, value in scoring.items() if key != "identities"}
+    return json.dumps(scoring, sort_keys=True)
+
+
+def _number(value: Any, file: Path, key: str) -> float:
+    """A number of a JSON file; NaN for null and for what is not finite."""
+    if value is None:
+        return math.nan
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise UserError(f"{file}: {key} = {shown(value)} is no number: remove the file and run the same command again.")
+    try:
+        number = float(value)
+    except OverflowError:
+        return math.nan
+    return number if math.isfinite(number) else math.nan
+
+
+def _size(value: Any, file: Path, key: str) -> int | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise UserError(f"{file}: {key} = {shown(value)} is no count: remove the file and run the same command again.")
+    return value
+
+
+def listed(values: Sequence[object]) -> str:
+    """ "1", "1 and 2", "1, 2 and 3"."""
+    words = [str(value) for value in values]
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -1,0 +1,303 @@
+"""Rows as values: which seeds count, mean and deviation of every cell, and what is to be said of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from apex_lab.errors import UserError
+from apex_lab.tables.choose import Choice
+from apex_lab.tables.found import Protocol, SeedRun, listed, read_arrangement
+from apex_lab.tables.spec import Column, Published, Row, Specification, Table
+
+DDOF = 1
+"""Seeds are a sample: deviations divide by n - 1 (metrics.md section 3)."""
+
+TRACKING = "tracking"
+"""Key of the column that says yes or no."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What is asked for; see conf/tables.yaml."""
+
+    data: str
+    scale: str
+    seeds: tuple[int, ...]
+    exclude_failed: Collection[str]
+    published: bool
+    yardsticks: bool
+    arrangement_mean: Literal["scenario", "object"]
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Mean and standard deviation of n values; the mean of none is NaN, the deviation of fewer than two None."""
+
+    n: int
+    mean: float
+    std: float | None
+
+
+def summarise(values: Iterable[float]) -> Summary:
+    """Mean and sample deviation of those values that are finite."""
+    finite = np.array([value for value in values if math.isfinite(value)], dtype=np.float64)
+    if finite.size == 0:
+        return Summary(0, math.nan, None)
+    std = float(finite.std(ddof=DDOF)) if finite.size > DDOF else None
+    return Summary(int(finite.size), float(finite.mean()), std)
+
+
+def rounded(value: float, decimals: int) -> str:
+    """A number as it is printed: no negative zero."""
+    text = f"{value:.{decimals}f}"
+    return text.removeprefix("-") if float(text) == 0 else text
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One entry of a table.
+
+    Attributes:
+        values: seed -> unrounded values (one, or one per scenario of table 4), failed seeds that do not count included.
+        summary: over the seeds that count; None where no run says anything about this column.
+        over_all: over all seeds with results.
+        published: what the paper prints.
+        best: whether it is the best of its column.
+    """
+
+    values: Mapping[int, tuple[float, ...]]
+    summary: Summary | None
+    over_all: Summary | None
+    published: Published | None
+    best: bool = False
+
+
+@dataclass(frozen=True)
+class Line:
+    """One row.
+
+    Attributes:
+        row: its specification.
+        label, latex: what it is called, without an asterisk.
+        asterisk: whether a footnote marked * belongs to it.
+        tracking: whether its components keep identities.
+        group: folder of its runs, None where there are none.
+        counted: seeds in the means.
+        excluded: seed -> why it does not count though it may have results (failed-seed rule).
+        failed: seed -> why it has no results: failed by the rule, or damaged.
+        unfinished: seed -> what its record says.
+        left_out: seed -> why its results cannot stand beside the others.
+        missing: seeds that were never started.
+        wanted: seeds that are asked for.
+        candidate: whether it competes for bold.
+        protocol: of its scores.
+        cells: key of the column -> entry.
+        notes: what is to be said of it.
+    """
+
+    row: Row
+    label: str
+    latex: str | None
+    asterisk: bool
+    tracking: bool
+    group: str | None
+    counted: tuple[int, ...]
+    excluded: dict[int, str]
+    failed: dict[int, str]
+    unfinished: dict[int, str]
+    left_out: dict[int, str]
+    missing: tuple[int, ...]
+    wanted: tuple[int, ...]
+    candidate: bool
+    protocol: Protocol | None
+    cells: dict[str, Cell]
+    notes: tuple[str, ...]
+
+    @property
+    def seeds(self) -> str:
+        """How many seeds count, as "3 of 4" where some do not."""
+        known = {*self.counted, *self.excluded, *self.failed, *self.unfinished, *self.left_out}
+        total = max(len(self.wanted), len(known))
+        return str(total) if len(self.counted) == total else f"{len(self.counted)} of {total}"
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What a table is filled with: the results of each seed of each row."""
+
+    results: Mapping[int, Mapping[str, tuple[float, ...]]] = field(default_factory=dict)
+    faults: Mapping[int, str] = field(default_factory=dict)
+
+
+def make_line(
+    row: Row, candidate: bool, table: Table, specification: Specification, choice: Choice, options: Options
+) -> Line:
+    """Fills a row.
+
+    Args:
+        row: which.
+        candidate: whether its section competes for bold.
+        table: where it stands.
+        specification: what it is called.
+        choice: its runs.
+        options: what is asked for.
+    """
+    group, model = choice.group, specification.models[row.model]
+    trained = group.runs if group else {}
+    content = _content(trained, table, options)
+    wanted = model.seeds or table.seeds or options.seeds
+    arranged = {*content.results, *content.faults, *wanted}
+    runs = {seed: run for seed, run in trained.items() if table.source == "metrics" or seed in arranged}
+    listed_for_exclusion = row.model in options.exclude_failed
+    excluded = {seed: run.failure for seed, run in runs.items() if run.failure and listed_for_exclusion}
+    failed = {
+        seed: why
+        for seed, run in runs.items()
+        if (why := _fault(run, content.faults.get(seed))) is not None and seed not in excluded
+    }
+    unfinished = {seed: run.why or "" for seed, run in runs.items() if run.state == "unfinished"}
+    left_out = group.left_out if group else {}
+    counted = tuple(sorted(seed for seed in content.results if seed not in excluded))
+    open_places = max(0, len(wanted) - len(trained))
+    missing = tuple(seed for seed in wanted if seed not in {*trained, *left_out})[:open_places]
+    columns = [column for column in table.columns if column.key != TRACKING]
+    cells = {column.key: _cell(row, column, content.results, counted) for column in columns}
+    notes = [
+        *choice.notes,
+        *(f"seed {seed} failed: {why}" for seed, why in sorted({**failed, **({} if counted else excluded)}.items())),
+        *(f"seed {seed} is not finished: {why}" for seed, why in sorted(unfinished.items())),
+        *_failures_that_count(runs, counted),
+        *_seeds_unlike(wanted, counted),
+        *_undefined(columns, cells, counted),
+        *_unexpected(row, columns, content.results, counted),
+    ]
+    if listed_for_exclusion and any(run.state == "finished" for run in runs.values()):
+        notes += _unchecked(runs)
+    return Line(
+        row=row,
+        label=specification.label(row),
+        latex=specification.latex(row),
+        asterisk=row.fails or bool(excluded and counted) or (options.published and row.published_excluded > 0),
+        tracking=model.tracking,
+        group=group.name if group else None,
+        counted=counted,
+        excluded={seed: str(why) for seed, why in excluded.items()},
+        failed=failed,
+        unfinished=unfinished,
+        left_out=left_out,
+        missing=missing,
+        wanted=wanted,
+        candidate=candidate and not row.fails,
+        protocol=group.protocol if group and counted and table.source == "metrics" else None,
+        cells=cells,
+        notes=tuple(notes),
+    )
+
+
+def _content(runs: Mapping[int, SeedRun], table: Table, options: Options) -> _Content:
+    """The results of a row's seeds for one kind of table."""
+    finished = {seed: run for seed, run in runs.items() if run.state == "finished"}
+    if table.source == "metrics":
+        return _Content({seed: {key: (value,) for key, value in run.scores.items()} for seed, run in finished.items()})
+    results: dict[int, dict[str, tuple[float, ...]]] = {}
+    faults: dict[int, str] = {}
+    for seed, run in finished.items():
+        try:
+            tasks = read_arrangement(run)
+        except UserError as error:
+            faults[seed] = str(error)
+            continue
+        if tasks is not None:
+            results[seed] = {key: _distances(scenarios, options) for key, scenarios in tasks.items()}
+    return _Content(results, faults)
+
+
+def _distances(scenarios: Sequence[Sequence[float]], options: Options) -> tuple[float, ...]:
+    """One value per scenario, the mean of its objects, or one per object."""
+    if options.arrangement_mean == "object":
+        return tuple(distance for scenario in scenarios for distance in scenario)
+    return tuple(summarise(scenario).mean for scenario in scenarios)
+
+
+def _fault(run: SeedRun, fault: str | None) -> str | None:
+    """Why a seed has no results though it should."""
+    if run.state == "diverged":
+        return f"{run.failure}; {run.why}"
+    return run.why if run.state == "damaged" else fault
+
+
+def _cell(
+    row: Row, column: Column, results: Mapping[int, Mapping[str, tuple[float, ...]]], counted: Sequence[int]
+) -> Cell:
+    values = {seed: scores[column.key] for seed, scores in sorted(results.items()) if column.key in scores}
+    valid = [seed for seed in counted if seed in values]
+    return Cell(
+        values,
+        summarise(value for seed in valid for value in values[seed]) if valid else None,
+        summarise(value for found in values.values() for value in found) if values else None,
+        row.published.get(column.published_as or column.key),
+    )
+
+
+def _failures_that_count(runs: Mapping[int, SeedRun], counted: Sequence[int]) -> list[str]:
+    return [
+        f"seed {seed} failed by the failed-seed rule ({runs[seed].failure}) and counts all the same, "
+        "since exclude_failed does not list this model."
+        for seed in counted
+        if runs[seed].failure
+    ]
+
+
+def _unchecked(runs: Mapping[int, SeedRun]) -> list[str]:
+    """For models whose failed seeds are left out: seeds that the rule cannot judge."""
+    unknown = [seed for seed, run in sorted(runs.items()) if run.state == "finished" and run.share is None]
+    if not unknown:
+        return []
+    return [
+        f"run.json of seed{'s' if len(unknown) > 1 else ''} {listed(unknown)} has no foreground_share, "
+        "so the failed-seed rule saw the loss alone: evaluate with split=val."
+    ]
+
+
+def _seeds_unlike(wanted: Sequence[int], counted: Sequence[int]) -> list[str]:
+    other = [seed for seed in counted if seed not in wanted]
+    return [f"mean over the seeds {listed(counted)}."] if other else []
+
+
+def _undefined(columns: Sequence[Column], cells: Mapping[str, Cell], counted: Sequence[int]) -> list[str]:
+    """Values that no mean can hold, and results that lack a column."""
+    notes = []
+    for column in columns:
+        values = cells[column.key].values
+        lacking = [seed for seed in counted if seed not in values]
+        nowhere = [seed for seed in counted if any(not math.isfinite(value) for value in values.get(seed, ()))]
+        if lacking:
+            notes.append(f"the results of seed {listed(lacking)} have no {column.label} ({column.key}).")
+        if nowhere:
+            notes.append(f"{column.label} is undefined (n/a) in seed {listed(nowhere)} and left out of the mean there.")
+    return notes
+
+
+def _unexpected(
+    row: Row, columns: Sequence[Column], results: Mapping[int, Mapping[str, tuple[float, ...]]], counted: Sequence[int]
+) -> list[str]:
+    """Values that show that the evaluation is wrong; frames without any object have scores of their own kind."""
+    notes = []
+    for seed in counted:
+        if any(results[seed].get("empty_frames", ())):
+            continue
+        wrong = [
+            f"{column.label} must be {wanted:g} and is {value:.6g}"
+            for column in columns
+            if (wanted := row.expected.get(column.key)) is not None
+            for value in results[seed].get(column.key, ())
+            if not math.isclose(value, wanted, abs_tol=1e-6)
+        ]
+        if wrong:
+            notes.append(f"{', '.join(wrong)}: do not trust this evaluation.")
+    return notes
