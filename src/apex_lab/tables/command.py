@@ -134,7 +134,7 @@ def make_tables(job: Tables) -> None:
     published = job.asked.published
     console.say(markdown.document(tables, published, commands, problems).rstrip("\n"))
     if not job.asked.dry_run:
-        for path in store(job.folder, tables, published, commands, problems):
+        for path in store(job, tables, commands, problems):
             console.say(str(path))
 
 
@@ -190,17 +190,21 @@ def this_version() -> Version:
     )
 
 
-def store(
-    folder: Path, tables: Sequence[Built], published: bool, commands: Sequence[Command], problems: Sequence[str]
-) -> list[Path]:
-    """Writes tables.md, tables.tex, tables.json and table_<number>.csv; their paths."""
-    make_folder(folder)
+def store(job: Tables, tables: Sequence[Built], commands: Sequence[Command], problems: Sequence[str]) -> list[Path]:
+    """Writes tables.md, tables.tex, tables.json and table_<number>.csv; their paths.
+
+    tables.json holds what `export.as_json` returns, `asked` (what was asked for) and `made_by` (the version that did it).
+    """
+    folder, published = make_folder(job.folder), job.asked.published
     paths = [folder / name for name in ("tables.md", "tables.tex", "tables.json")]
     write_text(paths[0], markdown.document(tables, published, commands, problems))
     write_text(paths[1], latex.document(tables, published, commands))
     commit, dirty = provenance.commit()
-    made_by = {"versions": provenance.versions(), "commit": commit, "dirty": dirty}
-    write_json(paths[2], {"made_by": made_by, **export.as_json(tables, commands, problems)})
+    about = {
+        "asked": {"data": job.data, "scale": job.scale, **job.asked.model_dump()},
+        "made_by": {"versions": provenance.versions(), "commit": commit, "dirty": dirty},
+    }
+    write_json(paths[2], {**about, **export.as_json(tables, commands, problems)})
     for table in tables:
         paths.append(folder / f"table_{table.number}.csv")
         write_text(paths[-1], export.as_csv(table))
