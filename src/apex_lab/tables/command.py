@@ -193,7 +193,7 @@ def this_version() -> Version:
 def store(job: Tables, tables: Sequence[Built], commands: Sequence[Command], problems: Sequence[str]) -> list[Path]:
     """Writes tables.md, tables.tex, tables.json and table_<number>.csv; their paths.
 
-    tables.json holds what `export.as_json` returns, `asked` (what was asked for) and `made_by` (the version that did it).
+    tables.json holds what `export.as_json` returns, `asked` (what was asked for) and `made_by` (which version).
     """
     folder, published = make_folder(job.folder), job.asked.published
     paths = [folder / name for name in ("tables.md", "tables.tex", "tables.json")]
