@@ -26,6 +26,8 @@ REFUSED = {
     "trainer.compile=1": "trainer.compile = 1 is wrong: input should be a valid boolean.",
     "trainer.precision=16": "trainer.precision = 16 is wrong: input should be 32 or 'bf16-mixed'.",
     "trainer.monitor=ari": "trainer.monitor = 'ari' is wrong",
+    "trainer.monitor=val/arifg": "trainer.monitor = 'val/arifg' is none of val/ari_fg,",
+    "data.test=0": "data.test = 0",
     "seed=-1": "seed = -1 is wrong: input should be greater than or equal to 0.",
     "seed=": "seed = '' is wrong: input should be a valid integer.",
     "seed=null": "seed = null is wrong: input should be a valid integer.",

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from apex_lab.config import build_model, conf_dir
+from apex_lab.errors import UserError
 from tests.conftest import REPOSITORY, compose_job
 
 
@@ -71,3 +72,23 @@ def test_weights_come_from_the_seed_alone() -> None:
 def test_conf_is_found_by_an_absolute_path() -> None:
     assert conf_dir().is_absolute()
     assert (conf_dir() / "evaluate.yaml").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            ("data.val=0",),
+            "data.val = 0 leaves nothing to validate on: raise it, or set trainer.validation_interval=null",
+        ),
+        (("data.test=0",), "data.test = 0 leaves nothing to evaluate"),
+        (
+            ("data.val=0", "trainer.validation_interval=null", "evaluation.split=val"),
+            "data.val = 0 leaves nothing to eval",
+        ),
+    ],
+)
+def test_nothing_to_look_at_is_refused(words: tuple[str, ...], told: str) -> None:
+    with pytest.raises(UserError, match=told):
+        compose_job("data=p2d", *words)
+    assert compose_job("data=p2d", "data.val=0", "trainer.validation_interval=null").config.data["val"] == 0

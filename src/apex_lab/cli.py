@@ -53,8 +53,11 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
     """
     console.setup()
     failures: list[tuple[str, str]] = []
+    jobs = 0
 
     def task(config: DictConfig) -> None:
+        nonlocal jobs
+        jobs += 1
         overrides = list(HydraConfig.get().overrides.task)
         name = " ".join(overrides)
         try:
@@ -80,9 +83,10 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
         console.error(f"Stopped by {stop}; the same command goes on from here.")
         sys.exit(128 + stop.signum)
     if failures:
-        console.error(f"{len(failures)} failed:" if len(failures) > 1 else "Failed:")
-        for name, reason in failures:
-            console.error(f"  {name}: {reason}")
+        if jobs > 1:
+            console.error(f"{len(failures)} of {jobs} failed:")
+            for name, reason in failures:
+                console.error(f"  {name}: {reason}")
         sys.exit(RUN_ERROR)
 
 

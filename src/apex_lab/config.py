@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from apex_lab import components
 from apex_lab.components import is_node
 from apex_lab.errors import UserError
+from apex_lab.metrics.modules import PAPER_SCORES
 from apex_lab.scene import SceneModel
 from apex_lab.schedules import Constant
 from apex_lab.validation import did_you_mean, sentence, shown, validate
@@ -157,6 +158,7 @@ def check_job(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequen
     refuse_missing(raw)
     _check_components(config)
     _check_objective(config)
+    _check_splits(config)
     device(config.trainer.accelerator)
     return Job(config, raw, dict(choices), tuple(overrides))
 
@@ -250,6 +252,29 @@ def _check_objective(config: Config) -> None:
     _same_names("loss", weights, getattr(model, "term_names", ()))
     if model.needs_training:
         build_optimizer(config, [torch.nn.Parameter(torch.zeros(1))])
+        _check_monitor(config.trainer, model)
+
+
+def _check_monitor(trainer: TrainerPart, model: SceneModel) -> None:
+    """The score that decides on best.ckpt must be one that validation gives."""
+    terms = getattr(model, "term_names", ())
+    known = [f"val/{name}" for name in (*PAPER_SCORES, "foreground_share", "loss", *terms)]
+    if trainer.monitor not in known:
+        guess = did_you_mean(trainer.monitor, known)
+        raise UserError(sentence(f"trainer.monitor = '{trainer.monitor}' is none of {', '.join(known)}{guess}"))
+
+
+def _check_splits(config: Config) -> None:
+    """What validation and evaluation look at must not be empty."""
+    if config.trainer.validation_interval is not None and config.data.get("val") == 0:
+        raise UserError(
+            "data.val = 0 leaves nothing to validate on: raise it, or set trainer.validation_interval=null."
+        )
+    if config.data.get(config.evaluation.split) == 0:
+        split = config.evaluation.split
+        raise UserError(
+            f"data.{split} = 0 leaves nothing to evaluate: raise it, or set evaluation.split to another split."
+        )
 
 
 def _same_names(key: str, given: Mapping[str, object], wanted: Sequence[str]) -> None:

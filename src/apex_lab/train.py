@@ -89,7 +89,7 @@ def _train(run: Run, device: torch.device) -> None:
     if checkpoint is None:
         model.initialise(torch.as_tensor(data.train_median()))
     else:
-        model.load_state_dict(checkpoint["weights"])
+        _load_weights(run, model, checkpoint["weights"])
         console.say(f"going on from step {checkpoint['step']}")
     loggers: list[Logger] = []
     if model.needs_training:
@@ -217,6 +217,16 @@ def _checkpoint(run: Run) -> dict[str, Any] | None:
             f"No whole checkpoint is left in {run.last.parent}: remove {run.folder} to start this run anew."
         )
     return None
+
+
+def _load_weights(run: Run, model: SceneModel, weights: dict[str, torch.Tensor]) -> None:
+    try:
+        model.load_state_dict(weights)
+    except RuntimeError as error:
+        raise UserError(
+            f"The checkpoint in {run.folder} was made by other code ({one_line(error)}): "
+            "go back to that code, or remove the folder to start anew."
+        ) from error
 
 
 def _untrained(run: Run, model: SceneModel) -> dict[str, Any]:
