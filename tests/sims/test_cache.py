@@ -60,6 +60,22 @@ def test_a_failure_leaves_nothing_behind() -> None:
     assert (cache.made_once("thing", {}, _slow_make) / "second").is_file()
 
 
+@pytest.mark.parametrize("damage", ["flipped", "cut", "deleted", "unsealed"])
+def test_damaged_files_are_made_again(damage: str) -> None:
+    folder = cache.made_once("thing", {}, _slow_make)
+    if damage == "flipped":
+        (folder / "second").write_text("3")
+    elif damage == "cut":
+        (folder / "second").write_text("")
+    else:
+        (folder / ("second" if damage == "deleted" else cache.CHECKSUMS)).unlink()
+    assert cache.made_once("thing", {}, _slow_make) == folder
+    assert (folder / "second").read_text() == "2"
+    before = (folder / "second").stat().st_mtime_ns
+    cache.made_once("thing", {}, _slow_make)
+    assert (folder / "second").stat().st_mtime_ns == before
+
+
 def test_another_recipe_is_another_folder() -> None:
     assert cache.made_once("thing", {"a": 1}, _slow_make) != cache.made_once("thing", {"a": 2}, _slow_make)
 
