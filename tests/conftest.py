@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable
@@ -62,11 +63,15 @@ def command(
         module = importlib.import_module(f"apex_lab.{entry}")
         monkeypatch.setattr(sys, "argv", [str(module.__file__), *words])
         capsys.readouterr()
-        code = 0
+        code, handlers, level = 0, logging.root.handlers[:], logging.root.level
         try:
             module.main()
         except SystemExit as stop:
             code = stop.code if isinstance(stop.code, int) else 1
+        finally:
+            # Hydra's --info sends all logging to the stream of this moment, and for good
+            logging.root.handlers[:] = handlers
+            logging.root.setLevel(level)
         said = capsys.readouterr()
         return Ended(code, said.out, said.err)
 
