@@ -36,7 +36,7 @@ def _make(options: argparse.Namespace) -> int:
     root: Path = options.out
     settings = settings_from(options.set, _begun(root))
     manifest = generate(root, settings, workers=options.workers)
-    if not options.no_card and not (root / "card").exists():
+    if not options.no_card and not (root / "card" / "README.md").exists():
         _card(argparse.Namespace(dir=root, out=None))
     made = ", ".join(f"{getattr(settings, split)} {split}" for split in SPLITS)
     redrawn = sum(record.redraws for record in manifest.records.values())

@@ -8,36 +8,39 @@ import numpy as np
 
 from sims.errors import SimError
 from sims.p2d import draw
-from sims.p2d.manifest import Manifest
+from sims.p2d.manifest import Manifest, write_at_once
 from sims.p2d.stats import MOVED_M, PUBLISHED, Stats, statistics
-from sims.p2d.store import SPLITS, array_path, total_bytes
+from sims.p2d.store import SPLITS, array_path, no_room, total_bytes
 from sims.p2d.verify import check
 
 STRIPS = 10
 SAMPLES = 6
 QUALITY = 82
+PAGE = "README.md"
 
 
 def write_card(root: Path, out: Path) -> Path:
-    """Writes `README.md`, `samples.jpg`, `strips.jpg` and `histograms.png`; returns the page's path.
+    """Writes `samples.jpg`, `strips.jpg`, `histograms.png` and, last, `README.md`; returns the page's path.
 
     Raises:
-        SimError: the folder is not finished or is damaged, or holds no trajectory.
+        SimError: the folder is not finished or is damaged, or holds no trajectory, or the disk is full.
     """
     manifest = check(root)
     splits = [split for split in SPLITS if getattr(manifest.settings, split)]
     if not splits:
         raise SimError(f"{root} holds no trajectory, so there is nothing to show")
     stats = statistics(root, manifest, splits)
-    out.mkdir(parents=True, exist_ok=True)
-    # JPEG for photographs: the page is small enough to be kept under version control.
-    draw.samples(manifest.classes, _crops(root, manifest, splits[0])).save(
-        out / "samples.jpg", quality=QUALITY, subsampling=0
-    )
-    draw.strips(_strips(root, manifest, splits[-1])).save(out / "strips.jpg", quality=QUALITY, subsampling=0)
-    draw.histograms(out / "histograms.png", stats, manifest.classes)
-    page = out / "README.md"
-    page.write_text(_page(manifest, stats, splits), encoding="utf-8")
+    page = out / PAGE
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        # JPEG for photographs: the page is small enough to be kept under version control.
+        samples = draw.samples(manifest.classes, _crops(root, manifest, splits[0]))
+        samples.save(out / "samples.jpg", quality=QUALITY, subsampling=0)
+        draw.strips(_strips(root, manifest, splits[-1])).save(out / "strips.jpg", quality=QUALITY, subsampling=0)
+        draw.histograms(out / "histograms.png", stats, manifest.classes)
+        write_at_once(page, _page(manifest, stats, splits))
+    except OSError as error:
+        raise no_room(error, error.filename or out) from error
     return page
 
 
@@ -100,6 +103,8 @@ original's.
 {_calibration(stats)}
 
 Published: the scores of the collapsed models in the paper's ablation table, which depend on the data alone.
+The number of objects is uniform (the paper states no distribution): with everything in view,
+{(settings.min_objects + settings.max_objects) / 2 + 1:.1f} things per frame, the arm counted.
 
 | | |
 |---|---|

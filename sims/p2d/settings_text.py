@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from sims.camera import Camera
 from sims.errors import SimError
 from sims.p2d.settings import Settings
 
@@ -55,6 +56,8 @@ def sentence(error: ValidationError) -> str:
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         known = sorted(Settings.model_fields)
+        if len(first["loc"]) > 1:  # only the camera has settings of its own
+            known = [f"camera.{name}" for name in sorted(Camera.model_fields)]
         near = difflib.get_close_matches(key, known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
         return f"unknown setting {key!r}: {hint}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from pathlib import Path
 
@@ -97,6 +98,16 @@ def test_page_of_nothing_is_refused(tmp_path: Path):
     make(tmp_path, small(train=0, val=0, test=0))
     with pytest.raises(SimError, match="holds no trajectory"):
         write_card(tmp_path, tmp_path / "card")
+
+
+def test_a_full_disk_is_named_and_leaves_no_page(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(draw, "histograms", full)
+    with pytest.raises(SimError, match="make room on that disk"):
+        write_card(root, tmp_path / "card")
+    assert not (tmp_path / "card" / "README.md").exists()
 
 
 def test_overlay_outlines_every_mask_in_its_colour():
