@@ -80,8 +80,8 @@ def kl_terms(
     }
 
 
-def mask_entropy(masks: Masks) -> Float[Tensor, "B T"]:
-    """L_H = sum over pixels and objects of -m_fg m_k log m_k (Eq. 21), per frame."""
+def mask_entropy(masks: Masks) -> Float[Tensor, "..."]:
+    """L_H = sum over pixels and objects of -m_fg m_k log m_k (Eq. 21), per frame (any leading shape)."""
     # x log x -> 0: where a mask underflows (or is -inf, an absent component), its log is replaced before multiplying.
     nothing = masks.log_objects < -60
     log_objects = masks.log_objects.masked_fill(nothing, 0.0)
