@@ -366,3 +366,37 @@ def test_a_compiled_run_has_the_same_checkpoint_layout(train: Callable[..., Ende
     plain, compiled = (weights(next(tmp_path.glob(f"{name}/*/seed_0"))) for name in ("outputs", "compiled"))
     assert plain.keys() == compiled.keys()
     assert all(value.isfinite().all() for value in compiled.values())
+
+
+@pytest.mark.slow
+def test_apex_on_p2d_killed_in_simulation_and_in_training_ends_as_unbroken(
+    command: Callable[..., Ended], tmp_path: Path
+) -> None:
+    words = ("scale=smoke", "trainer.max_steps=30", "trainer.checkpoint_interval=4", "evaluation.pictures=0")
+    assert command("train", *words, "paths.outputs=unbroken", "paths.data=other").code == 0
+
+    def begin() -> subprocess.Popen[bytes]:
+        environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+        program = (sys.executable, "-m", "apex_lab.train", *words)
+        return subprocess.Popen(program, cwd=tmp_path, env=environment, stdout=subprocess.DEVNULL)
+
+    simulating = begin()
+    while not list(tmp_path.glob("data/p2d_*/train/*")):
+        time.sleep(0.02)
+        assert simulating.poll() is None
+    simulating.kill()
+    simulating.wait()
+    assert not list(tmp_path.glob("data/p2d_*/manifest.json"))
+    training = begin()
+    run = wait_for_step(tmp_path, 8)
+    training.kill()
+    training.wait()
+    assert record(run)["steps"] < 30
+    assert command("train", *words).code == 0
+    equal(run, next(tmp_path.glob("unbroken/*/seed_0")))
+    ours, theirs = (
+        {path.relative_to(data): path.read_bytes() for path in data.rglob("*.np[yz]") if path.name[0] != "."}
+        for data in (next(tmp_path.glob("data/p2d_*")), next(tmp_path.glob("other/p2d_*")))
+    )
+    assert ours == theirs
+    assert ours
