@@ -166,11 +166,12 @@ def _predictions(asked: EvaluateConfig) -> Predictions:
             "leave it out."
         )
     output = Path(asked.output) if asked.output is not None else output_of(path)
-    check_output(output)
+    truth = None if asked.truth is None else Path(asked.truth)
+    check_output(output, (path, truth))
     return Predictions(
         path=path,
         format=asked.format,
-        truth=None if asked.truth is None else Path(asked.truth),
+        truth=truth,
         split=asked.split,
         partial=asked.partial,
         resize=asked.resize,

@@ -61,3 +61,10 @@ def test_another_split(p2d: Path, tmp_path: Path) -> None:
 def test_labels_are_the_stored_ones(p2d: Path) -> None:
     truth = open_truth(p2d)
     np.testing.assert_array_equal(truth.labels("test_00002"), P2D(p2d, "test")[2]["segmentation"].numpy())
+
+
+def test_what_holds_no_truth_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "truth.json").write_text("[]")
+    for path in (tmp_path, tmp_path / "truth.json"):
+        with pytest.raises(UserError, match="holds no ground truth: want an npz file"):
+            open_truth(path)

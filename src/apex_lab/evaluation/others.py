@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,12 +38,18 @@ def output_of(path: Path) -> Path:
     return path.with_name(f"{path.name if path.is_dir() else path.stem}.metrics.json")
 
 
-def check_output(path: Path) -> None:
+def check_output(path: Path, read: Sequence[Path | None] = ()) -> None:
     """Refuses, before any work, a place where the scores cannot be written.
 
+    Args:
+        path: the file to be written.
+        read: files that the scores are made from, which must outlive them.
+
     Raises:
-        UserError: it is a folder, or lies in one that cannot be written.
+        UserError: it is a folder or one of `read`, or lies in a folder that cannot be written.
     """
+    if any(given is not None and given.resolve() == path.resolve() for given in read):
+        raise UserError(f"output = {path} would overwrite what is scored: give the name of another file.")
     if path.is_dir():
         raise UserError(f"output = {path} is a folder: give the name of a file.")
     parent = path.absolute().parent

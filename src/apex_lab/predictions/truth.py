@@ -87,7 +87,7 @@ def open_truth(path: str | Path, split: str = "test") -> Truth:
         UserError: nothing there that could be ground truth.
     """
     path = Path(path)
-    if path.is_file():
+    if path.is_file() and path.suffix != ".json":
         return NpzTruth(path)
     if (path / "manifest.json").is_file():
         return P2DTruth(path, split)
