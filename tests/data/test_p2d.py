@@ -123,6 +123,14 @@ def test_median_of_a_folder_that_cannot_be_written(tmp_path: Path, monkeypatch: 
     torch.testing.assert_close(first, second)
 
 
+@pytest.mark.parametrize("size", [0, 60, 500])
+def test_a_median_that_was_cut_off_is_computed_anew(tmp_path: Path, size: int):
+    make(tmp_path, SETTINGS)
+    median = P2D(tmp_path, "val").median()
+    os.truncate(next(tmp_path.glob(".median_val_*.npy")), size)
+    torch.testing.assert_close(P2D(tmp_path, "val").median(), median)
+
+
 def test_an_empty_split_has_no_median(tmp_path: Path):
     make(tmp_path, small(val=0))
     data = P2D(tmp_path, "val")

@@ -107,7 +107,7 @@ class P2D(Dataset[dict[str, Any]]):
             raise UserError(f"split {self.split} of {self.root} is empty, so it has no median picture")
         count = len(frames) if sample is None else min(sample, len(frames))
         cache = self.root / f".median_{self.split}_{count}_{self.manifest.content[:8]}.npy"
-        if cache.exists():
+        with suppress(OSError, ValueError, EOFError):  # not there, or cut off by a power cut: computed anew
             return torch.from_numpy(np.load(cache))
         median = _median(frames, (np.arange(count) * len(frames)) // count)
         draft = cache.with_name(f"{cache.name}.{os.getpid()}")
