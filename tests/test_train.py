@@ -360,8 +360,8 @@ def test_a_model_that_does_not_train_is_evaluated(command: Callable[..., Ended],
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("g++") is None, reason="torch.compile needs a compiler")
 def test_a_compiled_run_has_the_same_checkpoint_layout(train: Callable[..., Ended], tmp_path: Path) -> None:
-    # the numbers differ: compiled code draws its noise from a generator of its own; in a process of its own, because the
-    # type checks of the tests cannot be compiled (pytorch #122093)
+    # The numbers differ: compiled code draws its noise from a generator of its own. It runs in a process of its own,
+    # because the type checks of the tests cannot be compiled (pytorch #122093).
     process = start(tmp_path, "trainer.compile=true", "paths.outputs=compiled")
     _, said = process.communicate()
     assert process.returncode == 0, said
