@@ -196,6 +196,8 @@ def test_never_means_never(tmp_path: Path):
     data.prepare_data()
     flip(data)
     module(tmp_path, verify="never").prepare_data()
+    with pytest.raises(UserError):  # the damage was there to be found
+        module(tmp_path, verify="always").prepare_data()
 
 
 @pytest.mark.parametrize(

@@ -217,8 +217,8 @@ class Apex(SceneModel):
         """Which videos may discover objects in this frame, (B, 1); all in evaluation.
 
         Rediscovering everything in every frame explains a video as well as tracking does, for the price of a few KL
-        terms, and once the presence of propagated objects has died nothing revives it. So in training a video that
-        carries objects is now and then left to them alone.
+        terms, and in early trials the presence of propagated objects died and did not revive. So in training a video
+        that carries objects is now and then left to them alone (a conjecture; not yet ablated by itself).
         """
         if not self.training:
             return torch.ones_like(carried_on)
