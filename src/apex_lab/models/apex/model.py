@@ -7,7 +7,7 @@ from typing import Annotated
 import torch
 from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from apex_lab.models.apex.background import Background
 from apex_lab.models.apex.encoder import ApexEncoder
@@ -65,6 +65,9 @@ class Apex(SceneModel):
         size_step, centre_step: largest change per frame of a size logit and of a centre.
         start_size: window size at the start of training, as a share of the image side.
         start_presence: p_proposal at the start of training.
+        start_mask: output of the mask decoder at the start of training (before the normalisation's squashing). Above
+            zero, windows start solid: one that reaches over background costs likelihood, so windows fit what they hold
+            before masks have shapes, instead of growing over everything.
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
@@ -93,6 +96,7 @@ class Apex(SceneModel):
         centre_step: Positive = 0.2,
         start_size: Share = 0.25,
         start_presence: Share = 0.1,
+        start_mask: float = 0.0,
     ) -> None:
         super().__init__()
         if image_size % 32 or (image_size // encoder.stride) % grid:
@@ -113,6 +117,7 @@ class Apex(SceneModel):
         )
         self.mask_decoder = SubpixelDecoder(what, glimpse_size, decoder_width, 1)
         self.colour_decoder = SubpixelDecoder(what, glimpse_size, decoder_width, 3)
+        nn.init.constant_(self.mask_decoder.head[0].bias, start_mask)
 
     def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
         """Starts the background at the training set's median."""

@@ -18,6 +18,11 @@ from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian, gaussian_from, relaxed_bernoulli
 
 
+NARROW = -3.0
+"""Where heads start the softplus of a standard deviation: at 0.05, so that what a window shows reaches the decoders before
+noise drowns it."""
+
+
 class Objects(NamedTuple):
     """State of K objects after a frame; everything that the next frame needs.
 
@@ -88,6 +93,8 @@ class Appearance(nn.Module):
             self.rnn.weight_ih[:, code:] = 0
             self.rnn.weight_hh.zero_()
             self.rnn.bias_ih[hidden : 2 * hidden] = -3.0  # update gate: take the new state
+            self.head.weight[:what].mul_(8.0)  # codes differ between objects from the first step on
+            self.head.bias[what:] = NARROW
 
     def forward(self, code: Tensor, what: Tensor, hidden: Tensor) -> tuple[Gaussian, Tensor]:
         """(N, code), (N, Z), (N, hidden) -> q(z_what), new hidden state."""
@@ -116,7 +123,7 @@ class Propagation(nn.Module):
         self.prior_what = mlp([hidden, hidden, 2 * what])
         self.prior_where = mlp([hidden, hidden, 8])
         self.prior_pres = mlp([hidden, hidden, 1])
-        still = torch.tensor([0.0] * 4 + [-2.0] * 4)  # no change, std 0.13
+        still = torch.tensor([0.0] * 4 + [NARROW] * 4)  # no change
         _set_last_bias(self.head_where, still)
         _set_last_bias(self.prior_where, still)
         stays = torch.tensor([3.0])  # an object that was there is expected to be there
@@ -207,7 +214,7 @@ class Discovery(nn.Module):
         with torch.no_grad():
             self.head_where.weight.mul_(0.1)
             assert self.head_where.bias is not None
-            self.head_where.bias.copy_(torch.tensor([size_logit] * 2 + [0.0] * 2 + [-2.0] * 4))
+            self.head_where.bias.copy_(torch.tensor([size_logit] * 2 + [0.0] * 2 + [NARROW] * 4))
         _set_last_bias(self.head_pres, torch.logit(torch.tensor([presence])))
 
     def forward(
