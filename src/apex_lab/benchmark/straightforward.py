@@ -23,7 +23,7 @@ from apex_lab.models.apex.masks import Masks
 from apex_lab.models.apex.model import FIRST_ID, Apex
 from apex_lab.models.apex.objective import kl_terms, mask_entropy
 from apex_lab.models.apex.objects import Objects, Proposals, context_probability, sample_presence, scope_in_windows
-from apex_lab.models.apex.rollout import Step, stack_steps
+from apex_lab.models.apex.rollout import Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import Carried, carry, gather_slots
 from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian, kl_gaussian
@@ -122,13 +122,20 @@ class Straightforward(Apex):
         scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
         paster = self._paster(proposals.place[:, 0], alphas.shape[-1])
         rows, columns = paster.inside()
+        claims = self.masks.claim(alphas, paster)
+        [cells] = frames_of(
+            look_at[:, None],
+            follow_in[:, None],
+            proposals,
+            *(x[:, None] for x in (alphas, claims, rows, columns)),
+        )
 
         open_ = self._may_discover(memory.carried_on, schedule).to(scope.dtype)
-        prob = proposals.prob[:, 0] * context_probability(scope, self.masks.claim(alphas, paster)) * open_
+        prob = cells.prob * context_probability(scope, claims) * open_
         prior = schedule["discovery_presence"] * scope_in_windows(scope, rows, columns) * open_
         pres = sample_presence(prob, temperature, self.training) * open_
         top = prob.detach().topk(self.render_top, dim=1).indices
-        candidates = Objects.join(before, self._found(proposals, 0, pres, top))
+        candidates = Objects.join(before, self._found(cells, pres, top))
         exists = torch.cat([memory.valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
         kept = carry(candidates.presence, exists, memory.ids, memory.next_id, self.keep_threshold)
         self._remember(memory, candidates, kept, schedule)
