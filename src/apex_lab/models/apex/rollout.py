@@ -47,8 +47,7 @@ def frames_of(
     """
     fields = (look_at, follow_in, proposals.what, proposals.place, proposals.prob, proposals.hidden_what)
     return [
-        Frame(*values)
-        for values in zip(*(x.unbind(1) for x in (*fields, alphas, claims, rows, columns)), strict=True)
+        Frame(*values) for values in zip(*(x.unbind(1) for x in (*fields, alphas, claims, rows, columns)), strict=True)
     ]
 
 
