@@ -59,7 +59,9 @@ def test_the_variant_gives_the_same_terms_masks_and_gradients(words: tuple[str, 
             assert b.grad is None
         else:
             assert b.grad is not None
-            torch.testing.assert_close(a.grad, b.grad, rtol=1e-3, atol=1e-4 * float(a.grad.abs().max()) + 1e-5, msg=name)
+            torch.testing.assert_close(
+                a.grad, b.grad, rtol=1e-3, atol=1e-4 * float(a.grad.abs().max()) + 1e-5, msg=name
+            )
 
 
 def test_cells_that_hold_nothing_make_no_difference_to_a_rendered_frame() -> None:
@@ -85,6 +87,8 @@ def test_grid_sampling_is_the_same_spatial_transformer() -> None:
     by_grid, by_matrix = GridPaster(windows, 8, 24), Paster(windows, 8, 24)
     glimpses = torch.randn(2, 5, 3, 8, 8)
     torch.testing.assert_close(by_grid.each(glimpses), by_matrix.each(glimpses), rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(by_grid.total(glimpses[:, :, 0]), by_matrix.total(glimpses[:, :, 0]), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        by_grid.total(glimpses[:, :, 0]), by_matrix.total(glimpses[:, :, 0]), rtol=1e-4, atol=1e-5
+    )
     for a, b in zip(by_grid.inside(), by_matrix.inside(), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)
