@@ -34,8 +34,14 @@ class ConvLSTM(nn.Module):
         cell = torch.zeros_like(hidden)
         states = []
         for frame in driven.unbind(1):
-            gates_in, forget, out, candidate = (frame + self.from_hidden(hidden)).chunk(4, dim=1)
-            cell = torch.sigmoid(forget) * cell + torch.sigmoid(gates_in) * torch.tanh(candidate)
-            hidden = torch.sigmoid(out) * torch.tanh(cell)
+            hidden, cell = self.step(frame, hidden, cell)
             states.append(hidden)
         return torch.stack(states, dim=1)
+
+    def step(
+        self, driven: Float[Tensor, "B C4 h w"], hidden: Float[Tensor, "B C h w"], cell: Float[Tensor, "B C h w"]
+    ) -> tuple[Float[Tensor, "B C h w"], Float[Tensor, "B C h w"]]:
+        """One frame: `from_input` of its features and the states before it -> hidden state and cell after it."""
+        gates_in, forget, out, candidate = (driven + self.from_hidden(hidden)).chunk(4, dim=1)
+        cell = torch.sigmoid(forget) * cell + torch.sigmoid(gates_in) * torch.tanh(candidate)
+        return torch.sigmoid(out) * torch.tanh(cell), cell

@@ -118,3 +118,24 @@ def test_gradients_are_finite_at_the_extremes(masks: MaskNormalisation, present:
     (finite.mean() + out.log_background.mean() + out.objects.mean()).backward()
     assert all(x.grad is None or x.grad.isfinite().all() for x in leaves)
     assert leaves[0].grad is not None
+
+
+def test_a_claim_s_gradient_is_that_of_autograd() -> None:
+    torch.manual_seed(0)
+    alpha = torch.randn(2, 3, 8, 8, dtype=torch.float64, requires_grad=True)
+    windows = torch.cat([torch.rand(2, 3, 2) * 0.6 + 0.2, torch.rand(2, 3, 2) - 0.5], dim=-1).double().requires_grad_()
+
+    def plainly(alpha: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
+        paster = Paster(windows, 8, 16)
+        rows, columns = paster.inside()
+        warped = paster.each(alpha[..., None, :, :]).squeeze(-3)
+        return torch.tanh(torch.nn.functional.softplus(warped)) * (rows[..., :, None] * columns[..., None, :])
+
+    def by_hand(alpha: torch.Tensor, windows: torch.Tensor) -> torch.Tensor:
+        return ApexNormalisation().claim(alpha, Paster(windows, 8, 16))
+
+    weights = torch.randn(2, 3, 16, 16, dtype=torch.float64)
+    wanted, found = plainly(alpha, windows), by_hand(alpha, windows)
+    torch.testing.assert_close(found, wanted)
+    gradients = [torch.autograd.grad((claims * weights).sum(), (alpha, windows)) for claims in (wanted, found)]
+    torch.testing.assert_close(gradients[1], gradients[0])

@@ -30,6 +30,7 @@ class Glimpses(nn.Module, ABC):
     def __init__(self, size: Size, width: Count) -> None:
         super().__init__()
         self.size, self.width = size * self.pixels_per_size, width
+        self.crop = crop  # an attribute, so that a benchmark can put another spatial transformer in its place
 
     def build(self, features: int, code: int) -> None:
         """Makes the CNNs; called once by the model, which knows F and the length of a code."""
@@ -54,7 +55,7 @@ class Glimpses(nn.Module, ABC):
         return self._encode(self.propagation, source, window)
 
     def _encode(self, encoder: nn.Module, source: Tensor, window: Tensor) -> Tensor:
-        return encoder(crop(source, window, self.size).flatten(0, 1)).unflatten(0, window.shape[:2])
+        return encoder(self.crop(source, window, self.size).flatten(0, 1)).unflatten(0, window.shape[:2])
 
 
 class FeatureGlimpses(Glimpses):

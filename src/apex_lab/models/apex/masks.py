@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -64,6 +64,30 @@ class MaskNormalisation(ABC):
         """All masks of a frame."""
 
 
+class _Claim(torch.autograd.Function):
+    """tanh(softplus(x)) times rows and columns, with its gradient written by hand.
+
+    A step does this for every cell of every frame at full resolution: plain autograd keeps five tensors of that size,
+    this keeps two.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, warped: Tensor, rows: Tensor, columns: Tensor) -> Tensor:  # type: ignore[override]
+        cover = F.softplus(warped).tanh_()
+        ctx.save_for_backward(warped, cover, rows, columns)
+        return (cover * rows[..., :, None]).mul_(columns[..., None, :])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
+        warped, cover, rows, columns = ctx.saved_tensors
+        to_inside = grad * cover
+        to_rows = (to_inside @ columns[..., :, None]).squeeze(-1)
+        to_columns = (rows[..., None, :] @ to_inside).squeeze(-2)
+        to_warped = (grad * rows[..., :, None]).mul_(columns[..., None, :])
+        to_warped.addcmul_(to_warped * cover, cover, value=-1)  # tanh' = 1 - tanh^2
+        return to_warped.mul_(torch.sigmoid(warped)), to_rows, to_columns
+
+
 class ApexNormalisation(MaskNormalisation):
     """APEX's mask normalisation, in log space throughout (Eq. 7-12).
 
@@ -96,7 +120,7 @@ class ApexNormalisation(MaskNormalisation):
         """tanh(softplus(alpha)) of the warped logits, inside the window only (the weights of p_context, Eq. 18)."""
         rows, columns = paster.inside()
         warped = paster.each(alpha[..., None, :, :]).squeeze(-3)
-        return torch.tanh(F.softplus(warped)) * (rows[..., :, None] * columns[..., None, :])
+        return _Claim.apply(warped, rows, columns)
 
     def _competition(
         self,

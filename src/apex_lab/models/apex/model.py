@@ -25,7 +25,7 @@ from apex_lab.models.apex.objects import (
     sample_presence,
     scope_in_windows,
 )
-from apex_lab.models.apex.rollout import Step, stack_steps
+from apex_lab.models.apex.rollout import Frame, Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import carry, gather_slots
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
@@ -149,8 +149,7 @@ class Apex(SceneModel):
 
     def _roll_out(self, look_at: Tensor, follow_in: Tensor, proposals: Proposals, schedule: Schedule) -> Step:
         """The part that depends on the frame before, frame by frame."""
-        b, t = look_at.shape[:2]
-        slots = self.max_objects
+        b, slots = len(look_at), self.max_objects
         state = Objects.empty(b, slots, proposals.what.shape[-1], self.hidden, proposals.what)
         valid = torch.zeros(b, slots, dtype=torch.bool, device=look_at.device)
         ids = torch.full((b, slots), ABSENT, device=look_at.device)
@@ -159,16 +158,16 @@ class Apex(SceneModel):
         alphas = self._alpha(proposals.what)
         paster = self._paster(proposals.place, alphas.shape[-1])
         claims = self.masks.claim(alphas, paster)
-        rows, columns = paster.inside()
+        frames = frames_of(look_at, follow_in, proposals, alphas, claims, *paster.inside())
         carried_on = torch.zeros(b, 1, dtype=torch.bool, device=look_at.device)
         steps = []
-        for i in range(t):
+        for frame in frames:
             before, beliefs = self.propagation(
                 state,
                 self.glimpses,
                 self.appearance,
-                look_at[:, i],
-                follow_in[:, i],
+                frame.look_at,
+                frame.follow_in,
                 valid,
                 schedule["temperature"],
                 self.training,
@@ -177,11 +176,11 @@ class Apex(SceneModel):
             scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
 
             open_ = self._may_discover(carried_on, schedule).to(scope.dtype)
-            prob = proposals.prob[:, i] * context_probability(scope, claims[:, i]) * open_  # Eq. 17
-            prior = schedule["discovery_presence"] * scope_in_windows(scope, rows[:, i], columns[:, i]) * open_
+            prob = frame.prob * context_probability(scope, frame.claims) * open_  # Eq. 17
+            prior = schedule["discovery_presence"] * scope_in_windows(scope, frame.rows, frame.columns) * open_
             pres = sample_presence(prob, schedule["temperature"], self.training) * open_
             top = prob.detach().topk(self.render_top, dim=1).indices
-            found = self._found(proposals, i, pres, top)
+            found = self._found(frame, pres, top)
 
             candidates = Objects.join(before, found)
             exists = torch.cat([valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
@@ -190,7 +189,7 @@ class Apex(SceneModel):
                 Step(
                     candidates.what,
                     candidates.place,
-                    torch.cat([alpha, gather_slots(alphas[:, i], top)], dim=1),
+                    torch.cat([alpha, gather_slots(frame.alpha, top)], dim=1),
                     candidates.presence,
                     exists & (candidates.presence > 0),
                     beliefs,
@@ -229,15 +228,15 @@ class Apex(SceneModel):
             return torch.ones_like(carried_on)
         return ~carried_on | (torch.rand(carried_on.shape, device=carried_on.device) < schedule["discover"])
 
-    def _found(self, proposals: Proposals, frame: int, pres: Tensor, top: Tensor) -> Objects:
+    def _found(self, cells: Frame, pres: Tensor, top: Tensor) -> Objects:
         """The rendered discoveries of a frame as objects; their other recurrent states start at zero."""
         nothing = pres.new_zeros(*top.shape, self.hidden)
         return Objects(
-            gather_slots(proposals.what[:, frame], top),
-            gather_slots(proposals.place[:, frame], top),
+            gather_slots(cells.what, top),
+            gather_slots(cells.place, top),
             gather_slots(pres, top),
             nothing,
-            gather_slots(proposals.hidden_what[:, frame], top),
+            gather_slots(cells.hidden_what, top),
             nothing,
             nothing,
         )

@@ -30,10 +30,11 @@ class DiscoveryPrior:
 
     def where(self, like: Float[Tensor, "... 4"]) -> Gaussian:
         """z_where ~ N(mean size, size_std) for the sizes and N(0, 1) (free within reach) for the centre."""
-        logit = size_logit(self.size)
+        # filled on the device: numbers copied there would make the host wait
+        size, centre = like.split(2, dim=-1)
         return Gaussian(
-            like.new_tensor([logit, logit, 0.0, 0.0]).expand_as(like),
-            like.new_tensor([self.size_std, self.size_std, 1.0, 1.0]).expand_as(like),
+            torch.cat([torch.full_like(size, size_logit(self.size)), torch.zeros_like(centre)], dim=-1),
+            torch.cat([torch.full_like(size, self.size_std), torch.ones_like(centre)], dim=-1),
         )
 
 

@@ -1,0 +1,165 @@
+"""Measures one row: speed, seconds by part, peak memory, graph breaks, kernels; all in the process that calls it."""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from torch._dynamo.exc import TorchDynamoException
+from torch._dynamo.utils import counters
+
+from apex_lab.benchmark.parts import PARTS
+from apex_lab.benchmark.work import Workload
+from apex_lab.config import Config
+from apex_lab.validation import one_line
+
+Mode = Literal["eager", "compiled", "cuda graph"]
+GIB = 2**30
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row to measure.
+
+    Attributes:
+        config: of the run; its precision is that of the row.
+        device: "cpu" or "cuda".
+        mode: `compiled` is `model.compile()`, `cuda graph` the same with mode="reduce-overhead".
+        training: a training step, or an inference.
+        batch_size, frames: of the batch.
+        warmup, repeats: steps before and during the measurement.
+    """
+
+    config: Config
+    device: str
+    mode: Mode
+    training: bool
+    batch_size: int
+    frames: int
+    warmup: int
+    repeats: int
+
+
+def measure(case: Case) -> dict[str, Any]:
+    """What one row says; see the keys. `unavailable` holds a sentence where the case cannot be run here."""
+    device = torch.device(case.device)
+    before = peak_memory(device)
+    work = Workload(case.config, device, case.batch_size, case.frames)
+    if case.mode != "eager":
+        work.model.compile(mode="reduce-overhead" if case.mode == "cuda graph" else None)
+    row: dict[str, Any] = {
+        "device": case.device,
+        "mode": case.mode,
+        "precision": str(case.config.trainer.precision),
+        "what": "training step" if case.training else "inference",
+        "batch_size": case.batch_size,
+        "frames": case.frames,
+        "image_size": case.config.data["image_size"],
+        "repeats": case.repeats,
+        "unavailable": None,
+    }
+    step = work.step(case.training)
+    counters.clear()
+    began = time.perf_counter()
+    try:
+        with torch.random.fork_rng(devices=[]):
+            seconds = timed(step, device, case.warmup, case.repeats)
+    except TorchDynamoException as error:
+        # PyTorch's own compiler could not do it here (no C++ compiler, no Triton): that is this row's result
+        return {**row, "unavailable": f"cannot be compiled here: {_reason(error)}"}
+    row |= spread(seconds, work.frames)
+    row["setup_seconds"] = time.perf_counter() - began - sum(seconds)
+    row["peak_memory_gib"] = peak_memory(device)
+    row["memory_before_gib"] = before
+    if case.mode != "eager":
+        row["graph_breaks"] = sum(counters["graph_break"].values())
+        row["graphs"] = counters["stats"]["unique_graphs"]
+    else:
+        row["parts"] = parts(work, case)
+    if device.type == "cuda":
+        row |= kernels(step)
+    return row
+
+
+def timed(step: Callable[[], object], device: torch.device, warmup: int, repeats: int) -> list[float]:
+    """Seconds of each of `repeats` steps after `warmup` others; the device is idle before and after each."""
+    return [once(step, device) for _ in range(warmup + repeats)][warmup:]
+
+
+def once(step: Callable[[], object], device: torch.device) -> float:
+    """Seconds of one step, from an idle device to an idle device."""
+    _wait(device)
+    began = time.perf_counter()
+    step()
+    _wait(device)
+    return time.perf_counter() - began
+
+
+def spread(seconds: list[float], frames: int) -> dict[str, Any]:
+    """Median, smallest and largest of a step's seconds, and of its frames per second."""
+    middle, low, high = statistics.median(seconds), min(seconds), max(seconds)
+    return {
+        "seconds": middle,
+        "seconds_min_max": [low, high],
+        "frames_per_second": frames / middle,
+        "frames_per_second_min_max": [frames / high, frames / low],
+    }
+
+
+def parts(work: Workload, case: Case) -> dict[str, float]:
+    """Median seconds of each part over as many further steps; empty parts are left out."""
+    runs = [work.seconds_by_part(case.training) for _ in range(case.repeats)]
+    return {
+        name: statistics.median(run.get(name, 0.0) for run in runs)
+        for name in PARTS
+        if any(name in run for run in runs)
+    }
+
+
+def kernels(step: Callable[[], object]) -> dict[str, int]:
+    """How many kernels (and copies) one step runs on the GPU, and how many launches from the host that takes."""
+    from torch.profiler import ProfilerActivity, profile
+
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as profiled:
+        step()
+        torch.cuda.synchronize()
+    events = list(profiled.events())
+    return {
+        "kernels": sum(event.device_type == torch.autograd.DeviceType.CUDA for event in events),
+        "launches": sum("LaunchKernel" in event.name or "GraphLaunch" in event.name for event in events),
+    }
+
+
+def peak_memory(device: torch.device) -> float | None:
+    """The most memory in GiB that was held so far: by tensors on a GPU, else by this process (its resident set).
+
+    None where the system does not say.
+    """
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / GIB
+    if sys.platform == "linux":
+        # not getrusage: what it says of a child begins with what the parent held when it made the child
+        lines = Path("/proc/self/status").read_text().splitlines()
+        return next(int(line.split()[1]) / 2**20 for line in lines if line.startswith("VmHWM:"))
+    if sys.platform == "darwin":
+        import resource
+
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / GIB
+    return None
+
+
+def _reason(error: TorchDynamoException) -> str:
+    """The first line of what stood in the way, which the compiler wraps in exceptions of its own."""
+    inner = getattr(error, "inner_exception", None) or error.__cause__ or error
+    return one_line(str(inner).strip().partition("\n")[0] or type(inner).__name__)
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

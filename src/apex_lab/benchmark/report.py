@@ -1,0 +1,102 @@
+"""What was measured, in words and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from apex_lab.benchmark.parts import PARTS
+
+Row = Mapping[str, Any]
+
+
+def about(hardware: Row, versions: Row) -> str:
+    """The machine in a few words."""
+    words = [hardware["cpu"], f"{hardware['cores']} cores", f"{hardware['threads']} threads"]
+    return ", ".join([*words, *([hardware["gpu"]] if "gpu" in hardware else []), f"torch {versions['torch']}"])
+
+
+def name(row: Row) -> str:
+    """What a row measures."""
+    precision = "" if row["precision"] == "32" else ", bf16"
+    return f"{row['device']}, {row['mode']}{precision}, {row['what']}"
+
+
+def line(row: Row) -> str:
+    """One row in a sentence."""
+    if row["unavailable"] is not None:
+        return f"{name(row)}: {row['unavailable']}"
+    low, high = row["frames_per_second_min_max"]
+    words = [
+        f"{name(row)}: {_speed(row['frames_per_second'])} frames/s ({_speed(low)} to {_speed(high)})",
+        f"batch {_batch(row)}",
+        f"peak memory {_memory(row['peak_memory_gib'])}",
+    ]
+    if "graph_breaks" in row:
+        words.append(f"{row['graph_breaks']} graph breaks, compiled in {row['setup_seconds']:.0f} s")
+    if "kernels" in row:
+        words.append(f"{row['kernels']} kernels, {row['launches']} launches")
+    return ", ".join(words)
+
+
+def whole_batch(row: Row) -> str:
+    """Peak memory of a training step on the whole batch."""
+    return f"cpu, training step on {_batch(row)}: peak memory {_memory(row['peak_memory_gib'])}, {row['seconds']:.1f} s"
+
+
+def comparison(compared: Row) -> str:
+    """APEX against each variant, a sentence each."""
+    said = []
+    for variant, found in compared["models"].items():
+        if variant == "apex":
+            continue
+        low, high = found["times_min_max"]
+        both = [_speed(compared["models"][model]["frames_per_second"]) for model in ("apex", variant)]
+        said.append(
+            f"{compared['device']}: APEX trains {found['apex_trains_times_as_many']:.2f} times as many frames/s as "
+            f'the variant "{variant}" ({low:.2f} to {high:.2f}; {" and ".join(both)}; '
+            f"batch {compared['batch_size']} x {compared['frames']} frames)"
+        )
+    return "\n".join(said)
+
+
+def tables(rows: Sequence[Row]) -> list[str]:
+    """All rows, then the seconds by part of those that have parts."""
+    measured = [row for row in rows if row["unavailable"] is None]
+    header = ["", "frames/s", "seconds", "peak memory"]
+    lines = [
+        [name(row), _speed(row["frames_per_second"]), f"{row['seconds']:.3f}", _memory(row["peak_memory_gib"])]
+        for row in measured
+    ]
+    made = [_table([header, *lines])] if lines else []
+    by_part = [row for row in measured if "parts" in row]
+    if by_part:
+        names = [part for part in PARTS if any(part in row["parts"] for row in by_part)]
+        lines = [
+            [part, *(f"{row['parts'][part]:.3f}" if part in row["parts"] else "" for row in by_part)] for part in names
+        ]
+        total = ["sum", *(f"{sum(row['parts'].values()):.3f}" for row in by_part)]
+        made.append(_table([["seconds by part", *(name(row) for row in by_part)], *lines, total]))
+    return made
+
+
+def _table(lines: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
+    return "\n".join(
+        "  ".join(
+            [row[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True))]
+        )
+        for row in lines
+    )
+
+
+def _batch(row: Row) -> str:
+    return f"{row['batch_size']} x {row['frames']} frames of {row['image_size']} x {row['image_size']}"
+
+
+def _memory(gib: float | None) -> str:
+    return "not known on this system" if gib is None else f"{gib:.2f} GiB"
+
+
+def _speed(frames: float) -> str:
+    return f"{frames:.3g}" if frames < 100 else f"{frames:,.0f}"

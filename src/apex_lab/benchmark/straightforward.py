@@ -1,0 +1,221 @@
+"""APEX as one would write it down first: what the benchmark compares `models.apex` with.
+
+The same parts, weights, equations and loss terms, and as wide. What differs is how they are computed:
+
+- everything happens frame by frame inside the loop over time: encoder, discovery, rendering, likelihood, KL, result;
+- every crop and paste is an `affine_grid` and a `grid_sample` with a picture of its own for every component;
+- the mixture likelihood is a `logsumexp` differentiated by autograd;
+- `render_top=None` renders all cells of discovery, as the published equations do; a number renders as many as APEX.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from apex_lab.benchmark.grid import GridPaster, grid_crop
+from apex_lab.models.apex.likelihood import MixtureLikelihood, log_normal
+from apex_lab.models.apex.masks import Masks
+from apex_lab.models.apex.model import FIRST_ID, Apex
+from apex_lab.models.apex.objective import kl_terms, mask_entropy
+from apex_lab.models.apex.objects import Objects, Proposals, context_probability, sample_presence, scope_in_windows
+from apex_lab.models.apex.rollout import Step, frames_of, stack_steps
+from apex_lab.models.apex.slots import Carried, carry, gather_slots
+from apex_lab.models.apex.windows import window_of
+from apex_lab.nn.distributions import Gaussian, kl_gaussian
+from apex_lab.scene import ABSENT, Scene, Schedule
+
+
+class PlainMixture(MixtureLikelihood):
+    """The mixture likelihood by `logsumexp` over all components, its gradient left to autograd."""
+
+    def __call__(
+        self,
+        image: Float[Tensor, "N 3 H W"],
+        log_objects: Float[Tensor, "N K H W"],
+        objects: Float[Tensor, "N K 3 H W"],
+        log_background: Float[Tensor, "N H W"],
+        background: Float[Tensor, "N 3 H W"],
+    ) -> Float[Tensor, "N"]:
+        by_object = log_normal(image[:, None], objects, self.sigma_fg)
+        by_background = log_normal(image, background, self.sigma_bg)
+        if self.mixture_over == "pixel":
+            by_object, by_background = by_object.sum(2, keepdim=True), by_background.sum(1, keepdim=True)
+        joint = torch.cat(
+            [by_object + log_objects[:, :, None], (by_background + log_background[:, None])[:, None]], dim=1
+        )
+        return torch.logsumexp(joint, dim=1).flatten(1).sum(1)
+
+
+class _Memory:
+    """What a frame hands to the next one."""
+
+    def __init__(self, model: Apex, frame: Tensor) -> None:
+        b, slots, side = len(frame), model.max_objects, frame.shape[-1] // model.encoder.stride
+        self.objects = Objects.empty(b, slots, model.appearance.what, model.hidden, frame)
+        self.valid = torch.zeros(b, slots, dtype=torch.bool, device=frame.device)
+        self.ids = torch.full((b, slots), ABSENT, device=frame.device)
+        self.next_id = torch.full((b,), FIRST_ID, device=frame.device)
+        self.carried_on = torch.zeros(b, 1, dtype=torch.bool, device=frame.device)
+        self.hidden = self.cell = frame.new_zeros(b, model.encoder.features, side, side)
+        self.features: Tensor | None = None
+        self.z_background: Tensor | None = None
+
+
+class Straightforward(Apex):
+    """Built with the arguments of `Apex`; takes its weights by `load_state_dict`."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.glimpses.crop = grid_crop
+        if isinstance(self.likelihood, MixtureLikelihood):
+            plain = self.likelihood
+            self.likelihood = PlainMixture(plain.sigma_fg, plain.sigma_bg, plain.mixture_over)
+
+    def _paster(self, place: Float[Tensor, "*batch 4"], glimpse: int) -> GridPaster:
+        return GridPaster(window_of(place), glimpse, self.image_size)
+
+    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
+        """As `Apex.forward`, frame by frame."""
+        memory = _Memory(self, video[:, 0])
+        return _joined([self._frame(video, i, memory, schedule) for i in range(video.shape[1])])
+
+    def _frame(self, video: Tensor, i: int, memory: _Memory, schedule: Schedule) -> Scene:
+        """Explains one frame and updates the memory."""
+        look_at, follow_in, features = self._sources(video, i, memory)
+        proposals = self.discovery(features, look_at[:, None], self.glimpses, self.appearance, self.training)
+        step = self._infer(look_at, follow_in, proposals, memory, schedule)
+        return self._render(video[:, i : i + 1], proposals, step, memory)
+
+    def _sources(self, video: Tensor, i: int, memory: _Memory) -> tuple[Tensor, Tensor, Tensor]:
+        """What is looked at in this frame and what is followed, (B, C, h, w), and its features (B, 1, F, h, w)."""
+        lstm = self.encoder.over_time
+        driven = lstm.from_input(self.encoder.dla(video[:, i] - 0.5))
+        memory.hidden, memory.cell = lstm.step(driven, memory.hidden, memory.cell)
+        features = memory.hidden[:, None]
+        before = features if memory.features is None else memory.features
+        memory.features = features
+        pair = torch.cat([before, features], dim=1)
+        look_at, follow_in = self.glimpses.sources(video[:, [max(i - 1, 0), i]], pair)
+        return look_at[:, -1], follow_in[:, -1], features
+
+    def _infer(
+        self, look_at: Tensor, follow_in: Tensor, proposals: Proposals, memory: _Memory, schedule: Schedule
+    ) -> Step:
+        """Propagation, presence of discoveries, filtering: the body of the loop in `Apex._roll_out`."""
+        temperature = schedule["temperature"]
+        before, beliefs = self.propagation(
+            memory.objects,
+            self.glimpses,
+            self.appearance,
+            look_at,
+            follow_in,
+            memory.valid,
+            temperature,
+            self.training,
+        )
+        alpha, alphas = self._alpha(before.what), self._alpha(proposals.what[:, 0])
+        scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
+        paster = self._paster(proposals.place[:, 0], alphas.shape[-1])
+        rows, columns = paster.inside()
+        claims = self.masks.claim(alphas, paster)
+        [cells] = frames_of(
+            look_at[:, None],
+            follow_in[:, None],
+            proposals,
+            *(x[:, None] for x in (alphas, claims, rows, columns)),
+        )
+
+        open_ = self._may_discover(memory.carried_on, schedule).to(scope.dtype)
+        prob = cells.prob * context_probability(scope, claims) * open_
+        prior = schedule["discovery_presence"] * scope_in_windows(scope, rows, columns) * open_
+        pres = sample_presence(prob, temperature, self.training) * open_
+        top = prob.detach().topk(self.render_top, dim=1).indices
+        candidates = Objects.join(before, self._found(cells, pres, top))
+        exists = torch.cat([memory.valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
+        kept = carry(candidates.presence, exists, memory.ids, memory.next_id, self.keep_threshold)
+        self._remember(memory, candidates, kept, schedule)
+        return Step(
+            candidates.what,
+            candidates.place,
+            torch.cat([alpha, gather_slots(alphas, top)], dim=1),
+            candidates.presence,
+            exists & (candidates.presence > 0),
+            beliefs,
+            prob,
+            prior,
+            pres,
+            kept.source,
+            kept.valid,
+            kept.ids,
+        )
+
+    def _remember(self, memory: _Memory, candidates: Objects, kept: Carried, schedule: Schedule) -> None:
+        memory.objects = candidates.gather(kept.source)
+        memory.ids, memory.next_id = kept.ids, kept.next_id
+        memory.carried_on = self._carried_on(len(kept.ids), schedule)
+        memory.valid = kept.valid & memory.carried_on
+
+    def _render(self, frame: Float[Tensor, "B 1 3 H W"], proposals: Proposals, step: Step, memory: _Memory) -> Scene:
+        """Rendering, likelihood, KL and the result of one frame."""
+        steps = stack_steps([step])
+        paster = self._paster(steps.place, steps.alpha.shape[-1])
+        masks = self.masks.compose(steps.alpha, steps.presence, steps.valid, paster)
+        colours = torch.sigmoid(self.colour_decoder(steps.what.flatten(0, 2))).unflatten(0, steps.presence.shape)
+        means = paster.each(colours)
+        backdrop, kl_background = self._backdrop(frame[:, 0], masks, memory)
+        log_likelihood = self.likelihood(
+            frame[:, 0], masks.log_objects[:, 0], means[:, 0], masks.log_background[:, 0], backdrop
+        )
+        slots = self.max_objects
+        terms = {
+            "nll": -log_likelihood,
+            **kl_terms(
+                steps.propagated,
+                steps.valid[..., :slots],
+                steps.presence[..., :slots],
+                proposals,
+                steps.discovery_prob,
+                steps.discovery_prior,
+                steps.discovery_pres,
+                self.discovery_prior,
+                self.direction,
+            ),
+            "kl_background": kl_background,
+            "mask_entropy": mask_entropy(masks).sum(1),
+        }
+        return self._scene(steps, masks, means, backdrop[:, None], terms)
+
+    def _backdrop(self, frame: Tensor, masks: Masks, memory: _Memory) -> tuple[Tensor, Tensor]:
+        """The background's picture (B, 3, H, W) and what its latent costs (B,)."""
+        q = self.background.posterior(masks.background[:, 0], frame)
+        z = q.sample(self.training)
+        history = [z] if memory.z_background is None else [memory.z_background, z]
+        p = self.background.prior(torch.stack(history, dim=1))
+        memory.z_background = z
+        return self.background.decode(z), kl_gaussian(q, Gaussian(p.mean[:, -1], p.std[:, -1]))
+
+
+def _joined(frames: Sequence[Scene]) -> Scene:
+    """Scenes of one frame each -> the scene of the video; terms are summed over frames, diagnostics averaged."""
+
+    def over_time(name: str) -> Any:
+        values = [getattr(frame, name) for frame in frames]
+        return None if values[0] is None else torch.cat(values, dim=1)
+
+    first = frames[0]
+    return Scene(
+        background=first.background,
+        terms={name: torch.stack([frame.terms[name] for frame in frames]).sum(0) for name in first.terms},
+        diagnostics={
+            name: torch.stack([frame.diagnostics[name] for frame in frames]).mean(0) for name in first.diagnostics
+        },
+        **{
+            name: over_time(name)
+            for name in ("masks", "ids", "presence", "appearance", "reconstruction", "windows", "means")
+        },
+    )

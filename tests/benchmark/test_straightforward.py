@@ -1,0 +1,94 @@
+"""The straightforward variant computes what APEX computes."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+from apex_lab.benchmark.grid import GridPaster, grid_crop
+from apex_lab.benchmark.straightforward import Straightforward
+from apex_lab.config import build_model, build_schedules
+from apex_lab.models.apex import Apex
+from apex_lab.nn.spatial_transformer import Paster, crop
+from apex_lab.scene import schedule_at
+from tests.conftest import compose_job
+
+
+def pair(*words: str, render_top: int | None = None) -> tuple[Apex, Straightforward, dict[str, torch.Tensor]]:
+    """The tiny APEX, its straightforward variant with the same weights, and the schedule of some step."""
+    job = compose_job("model=apex", "data=p2d", "scale=smoke", "model.start_presence=0.5", *words)
+    model = build_model(job.config)
+    assert isinstance(model, Apex)
+    with torch.no_grad():
+        for p in model.discovery.head_pres.parameters():
+            p.mul_(20.0)  # so that some cells propose an object and some do not
+    plain = copy.deepcopy(job.config)
+    plain.model.update(_target_=f"{Straightforward.__module__}.Straightforward", render_top=render_top)
+    variant = build_model(plain)
+    assert isinstance(variant, Straightforward)
+    variant.load_state_dict(model.state_dict())
+    return model, variant, schedule_at({name: value(3) for name, value in build_schedules(job.config).items()})
+
+
+VIDEO = torch.rand(3, 4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [(), ("+ablation=image_stn",), ("+ablation=gaussian_scalor_norm",), ("model.likelihood.mixture_over=pixel",)],
+    ids=" ".join,
+)
+def test_the_variant_gives_the_same_terms_masks_and_gradients(words: tuple[str, ...]) -> None:
+    model, variant, schedule = pair("model.render_top=null", *words)
+    scenes = [each.eval()(VIDEO, schedule) for each in (model, variant)]
+    fast, plain = scenes
+    assert (fast.ids[:, :, :-1] > 0).any()
+    assert torch.equal(fast.ids, plain.ids)
+    for name in fast.terms:
+        torch.testing.assert_close(fast.terms[name], plain.terms[name], rtol=2e-5, atol=1e-3, msg=name)
+    for name in ("masks", "presence", "appearance", "reconstruction", "windows", "means"):
+        torch.testing.assert_close(
+            getattr(fast, name), getattr(plain, name), rtol=1e-4, atol=1e-5, equal_nan=True, msg=name
+        )
+    for scene in scenes:
+        torch.stack([term.sum() for term in scene.terms.values()]).sum().backward()
+    for (name, a), b in zip(model.named_parameters(), variant.parameters(), strict=True):
+        if a.grad is None:
+            assert b.grad is None
+        else:
+            assert b.grad is not None
+            torch.testing.assert_close(
+                a.grad, b.grad, rtol=1e-3, atol=1e-4 * float(a.grad.abs().max()) + 1e-5, msg=name
+            )
+
+
+def test_cells_that_hold_nothing_make_no_difference_to_a_rendered_frame() -> None:
+    model, variant, schedule = pair("model.render_top=6", "model.max_objects=16")
+    last = model.discovery.head_pres[-1]
+    assert isinstance(last, torch.nn.Linear)
+    present = torch.tensor(16)
+    with torch.no_grad():
+        while present.max() > 6:  # until no frame has more objects than are rendered
+            last.bias.sub_(0.1)
+            variant.load_state_dict(model.state_dict())
+            fast, plain = (each.eval()(VIDEO, schedule) for each in (model, variant))
+            present = (plain.ids[:, :, :-1] > 0).sum(-1)
+    assert present.max() > 0
+    torch.testing.assert_close(fast.terms["nll"], plain.terms["nll"], rtol=2e-5, atol=1e-3)
+
+
+def test_grid_sampling_is_the_same_spatial_transformer() -> None:
+    torch.manual_seed(0)
+    windows = torch.cat([torch.rand(2, 5, 2) * 0.8 + 0.05, torch.rand(2, 5, 2) * 2.4 - 1.2], dim=-1)
+    image = torch.randn(2, 3, 12, 12)
+    torch.testing.assert_close(grid_crop(image, windows, 6), crop(image, windows, 6), rtol=1e-4, atol=1e-5)
+    by_grid, by_matrix = GridPaster(windows, 8, 24), Paster(windows, 8, 24)
+    glimpses = torch.randn(2, 5, 3, 8, 8)
+    torch.testing.assert_close(by_grid.each(glimpses), by_matrix.each(glimpses), rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        by_grid.total(glimpses[:, :, 0]), by_matrix.total(glimpses[:, :, 0]), rtol=1e-4, atol=1e-5
+    )
+    for a, b in zip(by_grid.inside(), by_matrix.inside(), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5)

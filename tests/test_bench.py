@@ -1,0 +1,266 @@
+"""`python -m apex_lab.bench`: what it writes, what it refuses, and that the step it measures never waits or breaks."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from apex_lab import bench
+from apex_lab.benchmark import child, report
+from apex_lab.benchmark.measure import Case, measure
+from apex_lab.benchmark.parts import PARTS
+from apex_lab.benchmark.work import Workload
+from apex_lab.config import check_job
+from apex_lab.errors import UserError
+from tests.conftest import TINY, Ended, compose_job
+
+APEX = ("model=apex", "data=p2d", "scale=smoke", "trainer=cpu")
+HERE = torch.device("cpu")
+
+
+def workload(*words: str, device: torch.device = HERE) -> Workload:
+    return Workload(compose_job(*APEX[:3], *words).config, device, 2, 3)
+
+
+def in_this_process(work: Callable[[Any], Any], asked: Any) -> Any:
+    return work(asked)
+
+
+class HostSynchronisation(Exception):
+    """An operation that has to wait for the device's result."""
+
+
+class _Operations(TorchDispatchMode):
+    """Raises for every operation whose result the host must see before it can go on."""
+
+    WAITS = ("_local_scalar_dense", "nonzero", "is_nonzero", "item", "equal", "masked_select", "_unique", "_unique2")
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        name = func.overloadpacket.__name__
+        if name in self.WAITS or (name in ("index", "index_put", "index_put_") and self._boolean(args[1])):
+            raise HostSynchronisation(name)
+        return func(*args, **(kwargs or {}))
+
+    @staticmethod
+    def _boolean(indices: Any) -> bool:
+        return any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in indices)
+
+
+class _Calls(TorchFunctionMode):
+    """Raises for every call that on a GPU would copy between host and device."""
+
+    COPIES = ("tolist", "numpy", "cpu", "__array__", "tensor", "as_tensor", "new_tensor", "from_numpy")
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if getattr(func, "__name__", "") in self.COPIES:
+            raise HostSynchronisation(func.__name__)
+        return func(*args, **(kwargs or {}))
+
+
+@contextlib.contextmanager
+def no_synchronisation() -> Iterator[None]:
+    with _Calls(), _Operations():
+        yield
+
+
+@pytest.mark.parametrize("words", [(), ("+ablation=image_stn",), ("+ablation=gaussian_scalor_norm",)], ids=" ".join)
+def test_nothing_in_the_training_step_waits_for_the_device(words: tuple[str, ...]) -> None:
+    work = workload(*words)
+    step = work.step(training=True)
+    step()
+    before = [p.detach().clone() for p in work.model.parameters()]
+    assert work.optimizer is not None
+    # as Lightning configures it on a GPU: Adam's step count is a tensor there
+    with no_synchronisation():
+        work.optimizer.zero_grad(set_to_none=True)
+        loss = work.learner.training_step(work.batch, 0)
+        loss.backward()
+        work.learner.configure_gradient_clipping(work.optimizer)
+    work.optimizer.step()
+    assert any(not torch.equal(a, b) for a, b in zip(before, work.model.parameters(), strict=True))
+
+
+@pytest.mark.parametrize(
+    "waits",
+    [
+        lambda x: x.sum().item(),
+        lambda x: bool(x.sum() > 0),
+        lambda x: x[x > 0],
+        lambda x: x.nonzero(),
+        lambda x: x.sum().tolist(),
+        lambda x: x.new_tensor([1.0]),
+        lambda x: torch.tensor(3.0),
+    ],
+)
+def test_the_watch_over_synchronisation_sees_it(waits: Callable[[torch.Tensor], object]) -> None:
+    with pytest.raises(HostSynchronisation), no_synchronisation():
+        waits(torch.ones(3))
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_the_training_step_never_waits_on_a_gpu() -> None:
+    work = workload("trainer=gpu", device=torch.device("cuda"))
+    step = work.step(training=True)
+    for _ in range(2):
+        step()
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+ONE_GRAPH = """
+import json, sys
+import torch
+from apex_lab.benchmark.work import Workload
+from apex_lab.config import check_job
+work = Workload(check_job(json.load(sys.stdin), {}).config, torch.device("cpu"), 1, 2)
+work.model.train()
+forward = torch.compile(work.model.forward, backend="eager", fullgraph=True)  # raises where a graph would break
+loss = work.learner.loss(forward(work.batch["video"].float() / 255, work.learner.schedule()).terms)
+loss.backward()
+assert loss.isfinite()
+"""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        (),
+        pytest.param(("+ablation=image_stn",), marks=pytest.mark.slow),
+        pytest.param(("+ablation=gaussian_scalor_norm",), marks=pytest.mark.slow),
+    ],
+    ids=" ".join,
+)
+def test_the_training_step_is_one_graph(words: tuple[str, ...], tmp_path: Path) -> None:
+    # In a process of its own, because the type checks of the tests cannot be compiled (pytorch #122093).
+    raw = json.dumps(compose_job(*APEX[:3], *words).raw)
+    command = [sys.executable, "-c", ONE_GRAPH]
+    process = subprocess.run(command, input=raw, capture_output=True, text=True, cwd=tmp_path)
+    assert process.returncode == 0, process.stderr
+
+
+def test_the_parts_are_all_there_and_add_up() -> None:
+    work = workload()
+    for training in (True, False):
+        work.step(training)()
+        seconds = work.seconds_by_part(training)
+        assert set(seconds) == set(PARTS) - (set() if training else {"backward", "update"})
+        assert all(value > 0 for value in seconds.values())
+    own = [vars(owner) for owner in (work.model, work.model.encoder, work.model.masks)]
+    assert not any(name in names for names in own for name in ("_roll_out", "_explain", "forward", "claim"))
+
+
+def test_writes_a_file_with_every_row(
+    command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "in_child", in_this_process)
+    ended = command("bench", *APEX, "trainer.compile=false", "bench.repeats=2", "bench.output=out/speed.json")
+    assert ended.code == 0, ended.err
+    told = json.loads((tmp_path / "out" / "speed.json").read_text())
+    assert [(row["mode"], row["what"]) for row in told["rows"]] == [("eager", "training step"), ("eager", "inference")]
+    for row in told["rows"]:
+        assert row["frames_per_second"] * row["seconds"] == pytest.approx(1 * 3)
+        assert row["peak_memory_gib"] > 0.05
+        assert 0.2 * row["seconds"] < sum(row["parts"].values()) < 5 * row["seconds"]
+    assert told["whole_batch"]["batch_size"] == 2
+    [compared] = told["comparisons"]
+    assert compared["models"]["apex"]["apex_trains_times_as_many"] == 1
+    assert set(compared["models"]) == {"apex", "straightforward", "straightforward, renders as many"}
+    assert told["versions"]["torch"] == torch.__version__
+    assert told["hardware"]["threads"] == 1
+    assert "peak memory" in ended.out
+    assert "times as many frames/s" in ended.out
+    assert list((tmp_path / "out").iterdir()) == [tmp_path / "out" / "speed.json"]
+
+
+def test_any_model_can_be_measured(
+    command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "in_child", in_this_process)
+    words = ("trainer=cpu", "trainer.compile=false", "bench.repeats=1")
+    assert command("bench", *TINY, *words).code == 0
+    assert command("bench", "model=color_clusters", "scale=smoke", *words).code == 0
+    told = [json.loads(path.read_text()) for path in (tmp_path / "outputs" / "bench").iterdir()]
+    assert sorted(len(each["rows"]) for each in told) == [1, 2]
+    assert all(each["comparisons"] == [] for each in told)
+
+
+REFUSED = {
+    "bench.repeats=0": "bench.repeats = 0 is wrong: input should be greater than or equal to 1.",
+    "+bench.repeat=3": "Unknown key bench.repeat = 3; did you mean 'repeats'?",
+    "bench.modes=[fast]": "bench.modes.0 = 'fast' is wrong: input should be 'eager', 'compiled' or 'cuda graph'.",
+    "bench.modes=[cuda graph]": "bench.modes holds 'cuda graph', but nothing is measured on a GPU: leave it out.",
+    "bench=3": "bench = 3 is wrong: give bench.repeats=... and the like.",
+    "bench.output=.": "bench.output = '.' is a folder: name a file.",
+    "model=oracle": "model=oracle reads the ground truth: choose a model that looks at the video.",
+    "trainer.max_step=3": "Unknown key trainer.max_step = 3; did you mean 'trainer.max_steps'?",
+    "data.frames=0": "data.frames = 0 is wrong: input should be greater than 0.",
+    "scale=cpuu": "did you mean 'cpu'?",
+}
+
+
+@pytest.mark.parametrize("word", REFUSED)
+def test_refuses_in_one_sentence(word: str, command: Callable[..., Ended], tmp_path: Path) -> None:
+    ended = command("bench", "scale=smoke", "trainer=cpu", word)
+    assert ended.code == 2
+    assert REFUSED[word] in ended.err
+    assert len(ended.err.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_composes_what_train_composes(command: Callable[..., Ended]) -> None:
+    words = ("scale=cpu", "+ablation=image_stn", "seed=3", "--cfg", "job", "--resolve")
+    train, measured = (command(entry, *words).out for entry in ("train", "bench"))
+    kept = [line for line in measured.splitlines() if line in train.splitlines()]
+    assert sorted(kept) == sorted(train.splitlines())
+
+
+def test_what_cannot_be_compiled_is_said_in_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise torch._dynamo.exc.BackendCompilerFailed(None, RuntimeError("No working C++ compiler"), None)
+
+    monkeypatch.setattr(Workload, "train", refuse)
+    row = measure(Case(compose_job(*APEX).config, "cpu", "compiled", True, 1, 2, 1, 1))
+    assert "No working C++ compiler" in row["unavailable"]
+    assert report.line(row).startswith("cpu, compiled, training step: cannot be compiled here: ")
+
+
+def kill_this_process(_: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def refuse_in_child(_: object) -> None:
+    raise UserError("No.")
+
+
+@pytest.mark.slow
+def test_a_child_that_dies_is_told() -> None:
+    with pytest.raises(UserError, match="ended by SIGKILL, as happens when memory runs out: lower data"):
+        child.in_child(kill_this_process, None)
+    with pytest.raises(UserError, match=r"^No\.$"):
+        child.in_child(refuse_in_child, None)
+
+
+@pytest.mark.slow
+def test_the_compiled_step_is_measured_in_a_process_of_its_own() -> None:
+    job = compose_job(*APEX)
+    row = child.in_child(measure, Case(check_job(job.raw, job.choices).config, "cpu", "compiled", True, 1, 2, 1, 1))
+    assert row["unavailable"] is None
+    assert row["graph_breaks"] == 0
+    assert row["graphs"] == 1
