@@ -35,6 +35,17 @@ def test_masks_sum_to_one(masks: MaskNormalisation, present: int, seed: int) -> 
     assert logs.abs().max() < 2e-5
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_ten_strong_objects_in_float32_sum_to_one(seed: int) -> None:
+    """Logits of 3 c = 15 have a spacing of 1e-6 in float32; the sum must not inherit it."""
+    g = torch.Generator().manual_seed(seed)
+    alpha = ApexNormalisation().logits(3 * torch.randn(4, 10, G, G, generator=g))
+    windows = torch.cat([0.1 + 0.8 * torch.rand(4, 10, 2, generator=g), 2 * torch.rand(4, 10, 2, generator=g) - 1], -1)
+    there = torch.ones(4, 10, dtype=torch.bool)
+    out = ApexNormalisation().compose(alpha, there.float(), there, Paster(windows, G, 64))
+    assert (out.objects.double().sum(-3) + out.background.double() - 1).abs().max() <= 7e-7
+
+
 @pytest.mark.parametrize("masks", [ApexNormalisation(), ScalorNormalisation()])
 def test_absent_components_are_exactly_nothing(masks: MaskNormalisation) -> None:
     raw, presence, valid, windows = scene(2)

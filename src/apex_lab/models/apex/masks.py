@@ -122,8 +122,11 @@ class ApexNormalisation(MaskNormalisation):
         s = self._occupancy(alpha, presence, paster)
         logit = self._competition(alpha, presence, valid, paster)
         # Where nothing is valid the softmax has no finite entry; any finite stand-in will do, since m_fg is zero there.
-        log_norm = torch.logsumexp(logit, dim=-3).masked_fill(~valid.any(-1)[..., None, None], 0.0)
-        log_share = logit - log_norm[..., None, :, :]
+        nothing = ~valid.any(-1)[..., None, None]
+        # A common shift changes no share, but logits of 3 c would cost the float32 sum of the masks its sixth decimal.
+        logit = logit - logit.detach().amax(-3).masked_fill(nothing, 0.0)[..., None, :, :]
+        log_norm = torch.logsumexp(logit, dim=-3).masked_fill(nothing, 0.0)
+        log_share = logit - log_norm[..., None, :, :]  # Eq. 10
         foreground = torch.tanh(s)
         log_foreground = torch.log(torch.tanh(s.clamp_min(TINY)))
         return Masks(
