@@ -129,3 +129,16 @@ def test_gradients_are_finite_at_the_extremes(masks: MaskNormalisation, present:
     (finite.mean() + out.log_background.mean() + out.objects.mean()).backward()
     assert all(x.grad is None or x.grad.isfinite().all() for x in leaves)
     assert leaves[0].grad is not None
+
+
+@pytest.mark.parametrize("masks", [ApexNormalisation(), ScalorNormalisation()])
+def test_where_no_window_reaches_objects_weigh_exactly_nothing(masks: MaskNormalisation) -> None:
+    window = torch.tensor([[[0.25, 0.25, -0.5, -0.5]]])
+    there = torch.ones(1, 1, dtype=torch.bool)
+    out = masks.compose(masks.logits(torch.ones(1, 1, G, G)), there.float(), there, Paster(window, G, SIZE))
+    outside = paste(torch.ones(1, 1, G, G), window[0], SIZE)[:, 0] == 0
+    assert outside.sum() > SIZE**2 / 2
+    assert (out.objects[:, 0][outside] == 0).all()
+    assert (out.log_objects[:, 0][outside] == -torch.inf).all()
+    assert (out.log_background[outside] == 0).all()
+    assert out.log_objects[:, 0][~outside].isfinite().all()
