@@ -188,6 +188,7 @@ class Apex(SceneModel):
                     torch.cat([alpha, gather_slots(alphas[:, i], top)], dim=1),
                     candidates.presence,
                     exists & (candidates.presence > 0),
+                    valid,
                     beliefs,
                     prob,
                     prior,
@@ -263,7 +264,7 @@ class Apex(SceneModel):
             "nll": -log_likelihood.unflatten(0, (b, t)).sum(1),
             **kl_terms(
                 steps.propagated,
-                steps.valid[..., :slots],
+                steps.alive,
                 steps.presence[..., :slots],
                 proposals,
                 steps.discovery_prob,
@@ -298,8 +299,7 @@ class Apex(SceneModel):
         what = held(steps.what) * carried[..., None]
         blend = (masks.objects[..., None, :, :] * means).sum(2) + masks.background[..., None, :, :] * backdrop
         live = carried.sum(-1).clamp_min(1)
-        alive = steps.valid[..., : self.max_objects]
-        kept = (alive * steps.propagated.q_pres).sum() / alive.sum().clamp_min(1)
+        kept = (steps.alive * steps.propagated.q_pres).sum() / steps.alive.sum().clamp_min(1)
         return Scene(
             masks=torch.cat([objects, (1 - objects.sum(2, keepdim=True)).clamp_min(0)], dim=2),
             background=torch.arange(self.max_objects + 1, device=carried.device) == self.max_objects,

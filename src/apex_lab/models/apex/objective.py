@@ -59,7 +59,7 @@ def kl_terms(
     """KL terms of all foreground objects (Eq. 4-6), those of z_what and z_where weighted by presence.
 
     Args:
-        propagated, valid, presence: of the P slots; invalid slots cost nothing.
+        propagated, valid, presence: of the P slots; slots that came into the frame empty cost nothing.
         proposals, discovery_prob, discovery_prior, discovery_pres: of all D cells.
         prior: of discovered objects.
         direction: of the KL of z_what and z_where.

@@ -259,6 +259,7 @@ def scope_in_windows(
 def context_probability(scope: Float[Tensor, "B H W"], claims: Float[Tensor, "B D H W"]) -> Float[Tensor, "B D"]:
     """p_context: share of each proposal's mask that is not yet explained, in [0, 1] (Eq. 18)."""
     claims = claims.flatten(2)
-    open_ = (claims @ scope.flatten(1)[..., None]).squeeze(-1)
+    # As one minus the explained share: with nothing propagated it is exactly one, whatever the rounding of the sums.
+    explained = (claims @ (1 - scope.flatten(1))[..., None]).squeeze(-1)
     tiny = 1e-6  # a window too small to hold a pixel centre claims nothing: its context is fully open
-    return ((open_ + tiny) / (claims.sum(-1) + tiny)).clamp(0, 1)
+    return (1 - explained / (claims.sum(-1) + tiny)).clamp_min(0)
