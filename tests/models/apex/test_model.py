@@ -5,53 +5,19 @@ import torch
 
 from apex_lab.models.apex import (
     Apex,
-    ApexEncoder,
     ApexNormalisation,
     Background,
-    FeatureGlimpses,
     GaussianLikelihood,
     ImageGlimpses,
     MixtureLikelihood,
     ScalorNormalisation,
 )
-from apex_lab.models.apex.objective import DiscoveryPrior
 from apex_lab.models.apex.objects import Objects, Propagation
 from apex_lab.models.apex.windows import Windows, window_of
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.spatial_transformer import Paster, pixel_centres
-from apex_lab.scene import Scene, schedule_at
-
-SCHEDULE = schedule_at({"temperature": 0.7, "discovery_presence": 0.1, "carry": 1.0, "discover": 0.8})
-
-
-def tiny(**changes: object) -> Apex:
-    """APEX with every part at its smallest; random weights spread so that all presences occur."""
-    torch.manual_seed(0)
-    parts: dict = {
-        "encoder": ApexEncoder(8, (4, 4, 6, 8, 8, 8), (1, 1, 1, 1)),
-        "glimpses": FeatureGlimpses(4, 6),
-        "masks": ApexNormalisation(),
-        "likelihood": MixtureLikelihood(),
-        "background": Background(32, 6, 6),
-        "discovery_prior": DiscoveryPrior(),
-        "what": 6,
-        "hidden": 12,
-        "grid": 4,
-        "max_objects": 3,
-        "render_top": 4,
-        "glimpse_size": 8,
-        "decoder_width": 4,
-        "start_presence": 0.5,
-    }
-    model = Apex(32, **(parts | changes))
-    with torch.no_grad():
-        for p in model.discovery.head_pres.parameters():
-            p.mul_(20.0)
-    return model
-
-
-def video(b: int = 3, t: int = 4) -> torch.Tensor:
-    return torch.rand(b, t, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+from apex_lab.scene import Scene
+from tests.models.apex.small import SCHEDULE, parts, tiny, video
 
 
 def check_scene(scene: Scene, b: int, t: int, slots: int) -> None:
@@ -315,17 +281,6 @@ def test_the_background_starts_at_the_median() -> None:
 
 def test_refusals() -> None:
     with pytest.raises(ValueError, match=r"model\.image_size=48"):
-        Apex(48, **tiny_parts())
+        Apex(48, **parts())
     with pytest.raises(ValueError, match="built for 32 px"):
         tiny()(torch.rand(1, 2, 3, 64, 64), SCHEDULE)
-
-
-def tiny_parts() -> dict:
-    return {
-        "encoder": ApexEncoder(8, (4, 4, 6, 8, 8, 8), (1, 1, 1, 1)),
-        "glimpses": FeatureGlimpses(4, 6),
-        "masks": ApexNormalisation(),
-        "likelihood": MixtureLikelihood(),
-        "background": Background(32, 6, 6),
-        "discovery_prior": DiscoveryPrior(),
-    }
