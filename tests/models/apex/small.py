@@ -56,17 +56,25 @@ def tiny(**changes: object) -> Apex:
 
 
 def lively(**changes: object) -> Apex:
-    """A tiny model whose objects move, vanish and make room for others; found by trying gains of its heads."""
+    """A tiny model whose objects move, cover each other, vanish and make room for others."""
     model = tiny(**changes)
     with torch.no_grad():
         model.encoder.over_time.from_input.weight.mul_(3.0)
-        model.propagation.head_pres[-1].weight.mul_(1000.0)
-        model.propagation.head_pres[-1].bias.fill_(-7.0)
         model.propagation.head_where[-1].weight.mul_(30.0)
         for prior in (model.propagation.prior_pres, model.propagation.prior_where, model.propagation.prior_what):
             prior[-1].weight.mul_(30.0)
         for decoder in (model.mask_decoder, model.colour_decoder):
             decoder.head[0].weight.mul_(5.0)
+            decoder.head[0].bias.add_(0.5)
+        # Presence: spread out, and centred so that about half of the objects vanish from frame to frame.
+        head = model.propagation.head_pres
+        head[-1].weight.mul_(1000.0)
+        head[-1].bias.fill_(100.0)
+        said: list[torch.Tensor] = []
+        hook = head.register_forward_hook(lambda module, inputs, output: said.append(output))
+        model.eval()(video(2, 5), SCHEDULE)
+        hook.remove()
+        head[-1].bias.sub_(torch.stack(said[1:]).median())
     return model
 
 

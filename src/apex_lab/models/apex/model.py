@@ -104,7 +104,6 @@ class Apex(SceneModel):
         self.direction, self.keep_threshold = kl, keep_threshold
         self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
         self.encoder, self.glimpses, self.background = encoder, glimpses, background
-        self.glimpses.build(encoder.features, hidden)
         windows = Windows(grid, reach, size_step, centre_step)
         self.appearance = Appearance(hidden, what, hidden)
         self.propagation = Propagation(hidden, what, hidden, windows)
@@ -113,6 +112,8 @@ class Apex(SceneModel):
         )
         self.mask_decoder = SubpixelDecoder(what, glimpse_size, decoder_width, 1)
         self.colour_decoder = SubpixelDecoder(what, glimpse_size, decoder_width, 3)
+        # Last, so that all other weights start at the same values whatever the glimpses are cut from.
+        self.glimpses.build(encoder.features, hidden)
 
     def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
         """Starts the background at the training set's median."""
