@@ -9,7 +9,7 @@ import torch
 
 from apex_lab.models.apex import Apex
 from tests.models.apex import naive
-from tests.models.apex.small import SCHEDULE, Inside, lively, video
+from tests.models.apex.small import SCHEDULE, lively, video
 
 P0 = float(SCHEDULE["discovery_presence"])
 

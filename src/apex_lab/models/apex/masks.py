@@ -118,7 +118,7 @@ class ApexNormalisation(MaskNormalisation):
         valid: Bool[Tensor, "... K"],
         paster: Paster,
     ) -> Masks:
-        """Eq. 8-12: softmax over the foreground (Eq. 10), times m_fg (Eq. 11); the background is the rest (Eq. 12)."""
+        """Softmax over the foreground (Eq. 10), times m_fg (Eq. 11); the background is the rest (Eq. 12)."""
         s = self._occupancy(alpha, presence, paster)
         logit = self._competition(alpha, presence, valid, paster)
         # Where nothing is valid the softmax has no finite entry; any finite stand-in will do, since m_fg is zero there.
@@ -127,15 +127,15 @@ class ApexNormalisation(MaskNormalisation):
         logit = logit - logit.detach().amax(-3).masked_fill(nothing, 0.0)[..., None, :, :]
         log_norm = torch.logsumexp(logit, dim=-3).masked_fill(nothing, 0.0)
         log_share = logit - log_norm[..., None, :, :]  # Eq. 10
-        foreground = torch.tanh(s)
+        foreground = torch.tanh(s)  # Eq. 8
         # Exactly nothing where no window reaches: a floor there would let a component's empty surroundings, which are
         # black, explain dark pixels that the background misses.
         log_foreground = torch.log(torch.tanh(s.clamp_min(TINY))).masked_fill(s < TINY, -torch.inf)
         return Masks(
-            objects=log_share.exp() * foreground[..., None, :, :],
+            objects=log_share.exp() * foreground[..., None, :, :],  # Eq. 11
             log_objects=log_share + log_foreground[..., None, :, :],
             foreground=foreground,
-            background=2 * torch.sigmoid(-2 * s),  # = 1 - tanh(s), without cancellation
+            background=2 * torch.sigmoid(-2 * s),  # Eq. 12: 1 - tanh(s), without cancellation
             log_background=F.logsigmoid(-2 * s) + math.log(2),
         )
 

@@ -120,7 +120,7 @@ class Apex(SceneModel):
         self.background.initialise(median)
 
     def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
-        """Explains a video (Eq. 14: propagated objects, then discovered ones, then the background, per frame).
+        """Explains a video.
 
         Args:
             video: RGB in [0, 1].
@@ -144,7 +144,11 @@ class Apex(SceneModel):
         return Paster(window_of(place), glimpse, self.image_size)
 
     def _roll_out(self, look_at: Tensor, follow_in: Tensor, proposals: Proposals, schedule: Schedule) -> Step:
-        """The part that depends on the frame before, frame by frame."""
+        """The part that depends on the frame before, frame by frame (Eq. 2, which is Eq. 13).
+
+        Within a frame (Eq. 14): propagated objects, then discovered ones; the background, whose posterior needs the
+        masks of both, is left to `_explain`.
+        """
         b, t = look_at.shape[:2]
         slots = self.max_objects
         state = Objects.empty(b, slots, proposals.what.shape[-1], self.hidden, proposals.what)
@@ -174,6 +178,7 @@ class Apex(SceneModel):
 
             open_ = self._may_discover(carried_on, schedule).to(scope.dtype)
             prob = proposals.prob[:, i] * context_probability(scope, claims[:, i]) * open_  # Eq. 17
+            # Eq. 6: the prior of a discovery's presence, given the propagated objects
             prior = schedule["discovery_presence"] * scope_in_windows(scope, rows[:, i], columns[:, i]) * open_
             pres = sample_presence(prob, schedule["temperature"], self.training) * open_
             top = prob.detach().topk(self.render_top, dim=1).indices
@@ -262,6 +267,7 @@ class Apex(SceneModel):
         )
         slots = self.max_objects
         terms = {
+            # Eq. 19, and below the three factors of Eq. 4 as KL terms of Eq. 20; with the mask entropy, Eq. 22
             "nll": -log_likelihood.unflatten(0, (b, t)).sum(1),
             **kl_terms(
                 steps.propagated,
