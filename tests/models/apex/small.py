@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
+from hydra import compose, initialize_config_dir
 
+from apex_lab.config import conf_dir, plain
 from apex_lab.models.apex import (
     Apex,
     ApexEncoder,
@@ -107,3 +110,10 @@ class Inside:
             model._explain, model.background.decode = explain, decode  # type: ignore[method-assign]
         self.proposals, self.steps = proposals[0], steps[0]
         self.z_background = backdrops[0].unflatten(0, x.shape[:2])
+
+
+@functools.cache
+def resolved(*words: str) -> dict[str, Any]:
+    """A command line's configuration as plain values; nothing is built."""
+    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
+        return plain(compose("train", overrides=list(words)))

@@ -9,16 +9,15 @@ from typing import Any
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from torch import Tensor
 
-from apex_lab.config import Config, build_model, build_optimizer, build_schedules, build_weights, conf_dir, plain
+from apex_lab.config import Config, build_model, build_optimizer, build_schedules, build_weights
 from apex_lab.learner import Learner
 from apex_lab.models.apex import Apex, FeatureGlimpses, GaussianLikelihood, ImageGlimpses
 from apex_lab.scene import Scene
 from tests.conftest import REPOSITORY, compose_job
 from tests.models.apex import naive
-from tests.models.apex.small import SIZE, Inside, video
+from tests.models.apex.small import SIZE, Inside, resolved, video
 
 LIKELIHOOD = {f"model.likelihood.{key}" for key in ("_target_", "sigma_fg", "sigma_bg", "mixture_over", "sigma")}
 MASKS = {f"model.masks.{key}" for key in ("_target_", "c", "outside")}
@@ -44,13 +43,6 @@ def flat(tree: Mapping[str, Any], path: str = "") -> dict[str, Any]:
         here = f"{path}{key}"
         rows |= flat(value, f"{here}.") if isinstance(value, Mapping) else {here: value}
     return rows
-
-
-@functools.cache
-def resolved(*words: str) -> dict[str, Any]:
-    """A command line's configuration as plain values."""
-    with initialize_config_dir(version_base="1.3", config_dir=str(conf_dir())):
-        return flat(plain(compose("train", overrides=list(words))))
 
 
 @functools.cache
@@ -93,7 +85,7 @@ def test_all_ablations_are_here() -> None:
 @pytest.mark.parametrize("scale", ["smoke", "cpu", "paper"])
 def test_the_configuration_differs_in_the_swapped_part_only(name: str, scale: str) -> None:
     words = ("model=apex", "data=p2d", f"scale={scale}")
-    base, other = resolved(*words), resolved(*words, f"+ablation={name}")
+    base, other = flat(resolved(*words)), flat(resolved(*words, f"+ablation={name}"))
     absent = object()
     differ = {key for key in base.keys() | other.keys() if base.get(key, absent) != other.get(key, absent)}
     assert differ == SWAPS[name]
