@@ -1,7 +1,8 @@
 """Closed forms against Monte Carlo and torch.distributions."""
 
+import pytest
 import torch
-from torch.distributions import Bernoulli, Normal, kl_divergence
+from torch.distributions import Bernoulli, Normal, RelaxedBernoulli, kl_divergence
 
 from apex_lab.nn.distributions import Gaussian, gaussian_from, kl_bernoulli, kl_gaussian, relaxed_bernoulli
 
@@ -47,3 +48,50 @@ def test_gaussian_from_bounds_the_standard_deviation() -> None:
     assert d.mean.tolist() == [[1.0, 2.0]]
     assert (d.std > 0).all()
     assert d.std.max() <= 5
+
+
+@pytest.mark.parametrize("prob", [0.02, 0.5, 0.9])
+@pytest.mark.parametrize("temperature", [0.3, 1.0])
+def test_relaxed_bernoulli_has_the_distribution_of_torch_s(prob: float, temperature: float) -> None:
+    """Against the closed-form cumulative distribution of samples, and against the density that torch gives."""
+    torch.manual_seed(2)
+    n = 100_000
+    z = relaxed_bernoulli(torch.full((n,), prob, dtype=torch.float64), torch.tensor(temperature)).sort().values
+    # P(z <= x) = sigmoid(temperature logit(x) - logit(prob)); Kolmogorov-Smirnov at a level of 1e-4
+    logit = torch.logit(torch.tensor(prob, dtype=torch.float64))
+    expected = torch.sigmoid(temperature * torch.logit(z) - logit)
+    assert (expected - torch.arange(1, n + 1) / n).abs().max() < 2.23 / n**0.5
+
+    theirs = RelaxedBernoulli(torch.tensor(temperature).double(), probs=torch.tensor(prob).double())
+    x = torch.linspace(0.05, 0.95, 10_001, dtype=torch.float64)
+    inside = torch.trapezoid(theirs.log_prob(x).exp(), x)
+    assert abs(((z > 0.05) & (z <= 0.95)).double().mean() - inside) < 5 * 0.5 / n**0.5
+
+
+def test_relaxed_bernoulli_gives_gradients_to_the_probability_alone() -> None:
+    prob = torch.tensor([0.0, 1e-9, 0.3, 1.0], requires_grad=True)
+    z = relaxed_bernoulli(prob, torch.tensor(0.3))
+    z.sum().backward()
+    assert prob.grad is not None
+    assert prob.grad.isfinite().all()
+    assert prob.grad[2] > 0
+    assert ((z >= 0) & (z <= 1)).all()
+
+
+def test_gaussian_samples_have_their_mean_and_spread_and_the_mean_is_what_evaluation_takes() -> None:
+    torch.manual_seed(3)
+    d = Gaussian(torch.tensor([1.0, -2.0]).expand(200_000, 2), torch.tensor([0.5, 2.0]).expand(200_000, 2))
+    z = d.sample(stochastic=True)
+    torch.testing.assert_close(z.mean(0), d.mean[0], rtol=0, atol=0.03)
+    torch.testing.assert_close(z.std(0), d.std[0], rtol=0.02, atol=0)
+    assert d.sample(stochastic=False) is d.mean
+
+
+def test_kl_bernoulli_against_monte_carlo_in_both_directions() -> None:
+    torch.manual_seed(4)
+    a, b = torch.tensor(0.3, dtype=torch.float64), torch.tensor(0.8, dtype=torch.float64)
+    for q, p in [(a, b), (b, a)]:
+        x = (torch.rand(400_000, dtype=torch.float64) < q).double()
+        sampled = Bernoulli(q).log_prob(x) - Bernoulli(p).log_prob(x)
+        assert (kl_bernoulli(q, p) - sampled.mean()).abs() < 5 * sampled.std() / len(x) ** 0.5
+    assert kl_bernoulli(a, a) == 0

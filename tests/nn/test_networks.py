@@ -1,5 +1,7 @@
 """Shapes, causality and start values of the shared networks."""
 
+import math
+
 import pytest
 import torch
 
@@ -63,3 +65,42 @@ def test_broadcast_decoder_and_glimpse_encoder_sizes() -> None:
     assert BroadcastDecoder(5, 32, 8, 3)(torch.randn(2, 5)).shape == (2, 3, 32, 32)
     assert GlimpseEncoder(6, 12, 8, 10)(torch.randn(2, 6, 12, 12)).shape == (2, 10)
     assert group_norm(30)(torch.randn(1, 30, 2, 2)).shape == (1, 30, 2, 2)
+
+
+def test_conv_lstm_against_loops_over_channels_and_pixels() -> None:
+    """Gates as sums over the 3 x 3 neighbourhood of inputs and of the hidden state before."""
+    torch.manual_seed(1)
+    c, h, w = 2, 3, 4
+    net = ConvLSTM(c).double()
+    x = torch.randn(1, 3, c, h, w, dtype=torch.float64)
+    kernel_x, kernel_h, bias = (
+        p.tolist() for p in (net.from_input.weight, net.from_hidden.weight, net.from_input.bias)
+    )
+    hidden = [[[0.0] * w for _ in range(h)] for _ in range(c)]
+    cell = [[[0.0] * w for _ in range(h)] for _ in range(c)]
+
+    def gate(index: int, picture: list, state: list, y: int, z: int) -> float:
+        total = bias[index]
+        for i in range(c):
+            for dy in range(3):
+                for dx in range(3):
+                    yy, xx = y + dy - 1, z + dx - 1
+                    if 0 <= yy < h and 0 <= xx < w:
+                        total += kernel_x[index][i][dy][dx] * picture[i][yy][xx]
+                        total += kernel_h[index][i][dy][dx] * state[i][yy][xx]
+        return total
+
+    def sigmoid(value: float) -> float:
+        return 1 / (1 + math.exp(-value))
+
+    out = net(x)
+    for t in range(3):
+        picture, state = x[0, t].tolist(), hidden
+        hidden = [[[0.0] * w for _ in range(h)] for _ in range(c)]
+        for k in range(c):
+            for y in range(h):
+                for z in range(w):
+                    enter, forget, leave, new = (gate(k + n * c, picture, state, y, z) for n in range(4))
+                    cell[k][y][z] = sigmoid(forget) * cell[k][y][z] + sigmoid(enter) * math.tanh(new)
+                    hidden[k][y][z] = sigmoid(leave) * math.tanh(cell[k][y][z])
+        torch.testing.assert_close(out[0, t], torch.tensor(hidden, dtype=torch.float64))

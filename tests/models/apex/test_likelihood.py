@@ -94,3 +94,20 @@ def test_the_gradient_written_by_hand_equals_autograd_and_finite_differences() -
     small = [x.detach()[..., :2, :2] for x in inputs]
     small[1] = small[1].clamp_min(-20)
     assert torch.autograd.gradcheck(likelihood, [x.clone().requires_grad_() for x in small])
+
+
+@pytest.mark.parametrize("likelihood", [MixtureLikelihood(), MixtureLikelihood(0.1, 0.04, "pixel")])
+def test_pixels_without_any_object_are_the_background_s_and_give_objects_no_gradient(
+    likelihood: MixtureLikelihood,
+) -> None:
+    image, _, means, _, background = case(torch.float32)
+    logs = torch.full((2, 3, 4, 5), -torch.inf)
+    leaves = [x.clone().requires_grad_() for x in (logs, means, torch.zeros(2, 4, 5), background)]
+    out = likelihood(torch.zeros_like(image), *leaves)
+    out.sum().backward()
+    want = torch.distributions.Normal(background, 0.04).log_prob(torch.zeros(())).sum((1, 2, 3))
+    torch.testing.assert_close(out, want)
+    assert all(x.grad is not None and x.grad.isfinite().all() for x in leaves)
+    assert (leaves[0].grad == 0).all()
+    assert (leaves[1].grad == 0).all()
+    assert (leaves[3].grad != 0).any()

@@ -35,6 +35,17 @@ def test_masks_sum_to_one(masks: MaskNormalisation, present: int, seed: int) -> 
     assert logs.abs().max() < 2e-5
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_ten_strong_objects_in_float32_sum_to_one(seed: int) -> None:
+    """Logits of 3 c = 15 have a spacing of 1e-6 in float32; the sum must not inherit it."""
+    g = torch.Generator().manual_seed(seed)
+    alpha = ApexNormalisation().logits(3 * torch.randn(4, 10, G, G, generator=g))
+    windows = torch.cat([0.1 + 0.8 * torch.rand(4, 10, 2, generator=g), 2 * torch.rand(4, 10, 2, generator=g) - 1], -1)
+    there = torch.ones(4, 10, dtype=torch.bool)
+    out = ApexNormalisation().compose(alpha, there.float(), there, Paster(windows, G, 64))
+    assert (out.objects.double().sum(-3) + out.background.double() - 1).abs().max() <= 7e-7
+
+
 @pytest.mark.parametrize("masks", [ApexNormalisation(), ScalorNormalisation()])
 def test_absent_components_are_exactly_nothing(masks: MaskNormalisation) -> None:
     raw, presence, valid, windows = scene(2)
@@ -139,3 +150,16 @@ def test_a_claim_s_gradient_is_that_of_autograd() -> None:
     torch.testing.assert_close(found, wanted)
     gradients = [torch.autograd.grad((claims * weights).sum(), (alpha, windows)) for claims in (wanted, found)]
     torch.testing.assert_close(gradients[1], gradients[0])
+
+
+@pytest.mark.parametrize("masks", [ApexNormalisation(), ScalorNormalisation()])
+def test_where_no_window_reaches_objects_weigh_exactly_nothing(masks: MaskNormalisation) -> None:
+    window = torch.tensor([[[0.25, 0.25, -0.5, -0.5]]])
+    there = torch.ones(1, 1, dtype=torch.bool)
+    out = masks.compose(masks.logits(torch.ones(1, 1, G, G)), there.float(), there, Paster(window, G, SIZE))
+    outside = paste(torch.ones(1, 1, G, G), window[0], SIZE)[:, 0] == 0
+    assert outside.sum() > SIZE**2 / 2
+    assert (out.objects[:, 0][outside] == 0).all()
+    assert (out.log_objects[:, 0][outside] == -torch.inf).all()
+    assert (out.log_background[outside] == 0).all()
+    assert out.log_objects[:, 0][~outside].isfinite().all()

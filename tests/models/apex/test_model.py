@@ -5,53 +5,19 @@ import torch
 
 from apex_lab.models.apex import (
     Apex,
-    ApexEncoder,
     ApexNormalisation,
     Background,
-    FeatureGlimpses,
     GaussianLikelihood,
     ImageGlimpses,
     MixtureLikelihood,
     ScalorNormalisation,
 )
-from apex_lab.models.apex.objective import DiscoveryPrior
-from apex_lab.models.apex.objects import Objects, Propagation
-from apex_lab.models.apex.windows import Windows, window_of
+from apex_lab.models.apex.objects import Objects
+from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian
-from apex_lab.nn.spatial_transformer import Paster, pixel_centres
-from apex_lab.scene import Scene, schedule_at
-
-SCHEDULE = schedule_at({"temperature": 0.7, "discovery_presence": 0.1, "carry": 1.0, "discover": 0.8})
-
-
-def tiny(**changes: object) -> Apex:
-    """APEX with every part at its smallest; random weights spread so that all presences occur."""
-    torch.manual_seed(0)
-    parts: dict = {
-        "encoder": ApexEncoder(8, (4, 4, 6, 8, 8, 8), (1, 1, 1, 1)),
-        "glimpses": FeatureGlimpses(4, 6),
-        "masks": ApexNormalisation(),
-        "likelihood": MixtureLikelihood(),
-        "background": Background(32, 6, 6),
-        "discovery_prior": DiscoveryPrior(),
-        "what": 6,
-        "hidden": 12,
-        "grid": 4,
-        "max_objects": 3,
-        "render_top": 4,
-        "glimpse_size": 8,
-        "decoder_width": 4,
-        "start_presence": 0.5,
-    }
-    model = Apex(32, **(parts | changes))
-    with torch.no_grad():
-        for p in model.discovery.head_pres.parameters():
-            p.mul_(20.0)
-    return model
-
-
-def video(b: int = 3, t: int = 4) -> torch.Tensor:
-    return torch.rand(b, t, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+from apex_lab.nn.spatial_transformer import Paster
+from apex_lab.scene import Scene
+from tests.models.apex.small import SCHEDULE, parts, tiny, video
 
 
 def check_scene(scene: Scene, b: int, t: int, slots: int) -> None:
@@ -205,44 +171,6 @@ def test_the_same_seed_gives_the_same_losses() -> None:
     assert len(set(first)) == 4
 
 
-class IdealWhere(torch.nn.Module):
-    """Stands in for the recurrent z_where network: knows the square's true motion of 2 px per frame to the right."""
-
-    def __init__(self, change: float, step: float) -> None:
-        super().__init__()
-        self.raw = torch.atanh(torch.tensor(change / step))
-
-    def forward(self, hidden: torch.Tensor) -> torch.Tensor:
-        raw = torch.zeros(*hidden.shape[:-1], 8)
-        raw[..., 3] = self.raw
-        return raw
-
-
-def test_propagation_alone_tracks_a_moving_square_exactly() -> None:
-    """Discovery is off; with ideal latents each frame's mask is the square that moved 2 px."""
-    torch.manual_seed(0)
-    size, step = 32, 0.2
-    windows = Windows(4, 1.5, 0.3, step)
-    model = tiny()
-    propagation = Propagation(12, 6, 12, windows)
-    propagation.head_where = IdealWhere(2 * 2 / size, step)  # type: ignore[assignment]
-    with torch.no_grad():
-        propagation.head_pres[-1].bias.fill_(20.0)
-    half = torch.logit(torch.tensor(0.25))
-    place = torch.stack([half, half, torch.tensor(0.0), torch.tensor(-0.5)])[None, None]
-    state = Objects(torch.randn(1, 1, 6), place, torch.ones(1, 1), *(torch.zeros(1, 1, 12) for _ in range(4)))
-    solid = torch.full((1, 1, 8, 8), 5.0)
-    masks = ApexNormalisation()
-    centres = pixel_centres(size, torch.zeros(()))
-    e = torch.randn(1, 8, 8, 8)
-    valid = torch.ones(1, 1, dtype=torch.bool)
-    for t in range(1, 6):
-        state, _ = propagation(state, model.glimpses, model.appearance, e, e, valid, SCHEDULE["temperature"], False)
-        composed = masks.compose(solid, state.presence, valid, Paster(window_of(state.place), 8, size))
-        truth = (centres.abs() < 0.25)[:, None] & ((centres - (-0.5 + t * 4 / size)).abs() < 0.25)[None]
-        assert torch.equal(composed.objects[0, 0] > 0.5, truth)
-
-
 def test_z_what_zero_gives_discovery_and_propagation_the_same_appearance() -> None:
     """Discovery infers z_what with the same networks as propagation, from z_what_0 = 0."""
     model = tiny().eval()
@@ -252,35 +180,6 @@ def test_z_what_zero_gives_discovery_and_propagation_the_same_appearance() -> No
     q, _ = model.appearance(code, torch.zeros(16, 6), torch.zeros(16, 12))
     torch.testing.assert_close(proposals.q_what.mean[0, 0], q.mean)
     assert isinstance(q, Gaussian)
-
-
-def test_ablations_change_their_part_only() -> None:
-    x, base = video(), tiny()
-    variants = {
-        "image_stn": tiny(glimpses=ImageGlimpses(4, 6)),
-        "scalor_norm": tiny(masks=ScalorNormalisation()),
-        "gaussian": tiny(likelihood=GaussianLikelihood()),
-        "gaussian_scalor_norm": tiny(likelihood=GaussianLikelihood(), masks=ScalorNormalisation()),
-    }
-    weights = base.state_dict()
-    for name, model in variants.items():
-        own = model.state_dict()
-        if name != "image_stn":
-            assert own.keys() == weights.keys()
-        shared = [k for k in weights if not k.startswith("glimpses.")]
-        model.load_state_dict({k: weights[k] for k in shared}, strict=False)
-        assert all(own[k].shape == weights[k].shape for k in shared)
-    outputs = {name: model.eval()(x, SCHEDULE) for name, model in variants.items()}
-    reference = base.eval()(x, SCHEDULE)
-    same = outputs["gaussian"]
-    torch.testing.assert_close(same.masks, reference.masks)
-    assert all(torch.equal(same.terms[k], reference.terms[k]) for k in reference.terms if k != "nll")
-    assert not torch.equal(same.terms["nll"], reference.terms["nll"])
-    for name in ("scalor_norm", "image_stn"):
-        assert not torch.allclose(outputs[name].reconstruction, reference.reconstruction)
-    both, norm = outputs["gaussian_scalor_norm"], outputs["scalor_norm"]
-    torch.testing.assert_close(both.masks, norm.masks)
-    assert not torch.equal(both.terms["nll"], norm.terms["nll"])
 
 
 @pytest.mark.parametrize(
@@ -315,17 +214,6 @@ def test_the_background_starts_at_the_median() -> None:
 
 def test_refusals() -> None:
     with pytest.raises(ValueError, match=r"model\.image_size=48"):
-        Apex(48, **tiny_parts())
+        Apex(48, **parts())
     with pytest.raises(ValueError, match="built for 32 px"):
         tiny()(torch.rand(1, 2, 3, 64, 64), SCHEDULE)
-
-
-def tiny_parts() -> dict:
-    return {
-        "encoder": ApexEncoder(8, (4, 4, 6, 8, 8, 8), (1, 1, 1, 1)),
-        "glimpses": FeatureGlimpses(4, 6),
-        "masks": ApexNormalisation(),
-        "likelihood": MixtureLikelihood(),
-        "background": Background(32, 6, 6),
-        "discovery_prior": DiscoveryPrior(),
-    }

@@ -59,11 +59,11 @@ class Background(nn.Module):
             last.bias.zero_()
 
     def posterior(self, mask: Float[Tensor, "N H W"], image: Float[Tensor, "N 3 H W"]) -> Gaussian:
-        """q(z_bg | m_bg, x): a CNN on the background mask and the image."""
+        """q(z_bg | m_bg, x), the first factor of Eq. 14: a CNN on the background mask and the image."""
         return gaussian_from(self.encoder(torch.cat([mask[:, None], image], dim=1)))
 
     def prior(self, z: Float[Tensor, "B T Z"]) -> Gaussian:
-        """p(z_bg_t | z_bg_{t-1}) for every frame; N(0, 1) at the first."""
+        """p(z_bg_t | z_bg_{t-1}) for every frame, the first factor of Eq. 4; N(0, 1) at the first."""
         first = standard_normal(z[:, :1])
         later = gaussian_from(self.transition(z[:, :-1]))
         return Gaussian(*(torch.cat([a, b], dim=1) for a, b in zip(first, later, strict=True)))

@@ -80,7 +80,7 @@ class Likelihood(ABC):
 
         Args:
             image: RGB in [0, 1].
-            log_objects: log masks of the objects; -inf for absent ones.
+            log_objects: log masks of the objects; -inf where a mask is zero.
             objects: their means, RGB in [0, 1].
             log_background: log mask of the background; finite.
             background: its mean.
@@ -113,8 +113,9 @@ class MixtureLikelihood(Likelihood):
             return _LogMixture.apply(*args).flatten(1).sum(1)
         by_object = log_normal(image[:, None], objects, self.sigma_fg).sum(2)
         by_background = log_normal(image, background, self.sigma_bg).sum(1)
-        foreground = torch.logsumexp(by_object + log_objects, dim=1)
-        return torch.logaddexp(foreground, by_background + log_background).flatten(1).sum(1)
+        # One sum over all components: over the objects alone it has no gradient where all their masks are zero.
+        parts = torch.cat([by_object + log_objects, (by_background + log_background)[:, None]], dim=1)
+        return torch.logsumexp(parts, dim=1).flatten(1).sum(1)
 
 
 class GaussianLikelihood(Likelihood):

@@ -19,14 +19,14 @@ from torch import Tensor
 from apex_lab.nn.spatial_transformer import Paster
 
 TINY = 1e-30
-"""Floor inside logarithms; a mask below it is zero for every purpose in float32."""
+"""A mask below it is zero: its logarithm is -inf, and no gradient comes from it."""
 
 
 class Masks(NamedTuple):
     """Masks of one set of components and of the background; logs are for the likelihood, shares for everything else.
 
     objects: (..., K, H, W); foreground, background: (..., H, W). objects.sum(-3) + background = 1.
-    log_objects: -inf for invalid components; log_background: finite.
+    log_objects: -inf for invalid components and wherever a mask is below `TINY`; log_background: finite.
     """
 
     objects: Tensor
@@ -142,19 +142,24 @@ class ApexNormalisation(MaskNormalisation):
         valid: Bool[Tensor, "... K"],
         paster: Paster,
     ) -> Masks:
-        """Eq. 8-12: softmax over the foreground (Eq. 10), times m_fg (Eq. 11); the background is the rest (Eq. 12)."""
+        """Softmax over the foreground (Eq. 10), times m_fg (Eq. 11); the background is the rest (Eq. 12)."""
         s = self._occupancy(alpha, presence, paster)
         logit = self._competition(alpha, presence, valid, paster)
         # Where nothing is valid the softmax has no finite entry; any finite stand-in will do, since m_fg is zero there.
-        log_norm = torch.logsumexp(logit, dim=-3).masked_fill(~valid.any(-1)[..., None, None], 0.0)
-        log_share = logit - log_norm[..., None, :, :]
-        foreground = torch.tanh(s)
-        log_foreground = torch.log(torch.tanh(s.clamp_min(TINY)))
+        nothing = ~valid.any(-1)[..., None, None]
+        # A common shift changes no share, but logits of 3 c would cost the float32 sum of the masks its sixth decimal.
+        logit = logit - logit.detach().amax(-3).masked_fill(nothing, 0.0)[..., None, :, :]
+        log_norm = torch.logsumexp(logit, dim=-3).masked_fill(nothing, 0.0)
+        log_share = logit - log_norm[..., None, :, :]  # Eq. 10
+        foreground = torch.tanh(s)  # Eq. 8
+        # Exactly nothing where no window reaches: a floor there would let a component's empty surroundings, which are
+        # black, explain dark pixels that the background misses.
+        log_foreground = torch.log(torch.tanh(s.clamp_min(TINY))).masked_fill(s < TINY, -torch.inf)
         return Masks(
-            objects=log_share.exp() * foreground[..., None, :, :],
+            objects=log_share.exp() * foreground[..., None, :, :],  # Eq. 11
             log_objects=log_share + log_foreground[..., None, :, :],
             foreground=foreground,
-            background=2 * torch.sigmoid(-2 * s),  # = 1 - tanh(s), without cancellation
+            background=2 * torch.sigmoid(-2 * s),  # Eq. 12: 1 - tanh(s), without cancellation
             log_background=F.logsigmoid(-2 * s) + math.log(2),
         )
 
@@ -201,5 +206,5 @@ class ScalorNormalisation(MaskNormalisation):
         present = torch.where(valid, presence, torch.zeros_like(presence))
         objects, foreground = self._normalised(self._warped(alpha, present, paster))
         background = 1 - foreground
-        log_objects = objects.clamp_min(TINY).log().masked_fill(~valid[..., None, None], -torch.inf)
+        log_objects = objects.clamp_min(TINY).log().masked_fill(objects < TINY, -torch.inf)
         return Masks(objects, log_objects, foreground, background, background.clamp_min(1e-6).log())

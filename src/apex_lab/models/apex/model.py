@@ -108,7 +108,6 @@ class Apex(SceneModel):
         self.direction, self.keep_threshold = kl, keep_threshold
         self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
         self.encoder, self.glimpses, self.background = encoder, glimpses, background
-        self.glimpses.build(encoder.features, hidden)
         windows = Windows(grid, reach, size_step, centre_step)
         self.appearance = Appearance(hidden, what, hidden)
         self.propagation = Propagation(hidden, what, hidden, windows)
@@ -117,6 +116,8 @@ class Apex(SceneModel):
         )
         self.mask_decoder = SubpixelDecoder(what, glimpse_size, decoder_width, 1)
         self.colour_decoder = SubpixelDecoder(what, glimpse_size, decoder_width, 3)
+        # Last, so that all other weights start at the same values whatever the glimpses are cut from.
+        self.glimpses.build(encoder.features, hidden)
         nn.init.constant_(self.mask_decoder.head[0].bias, start_mask)
 
     def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
@@ -124,7 +125,7 @@ class Apex(SceneModel):
         self.background.initialise(median)
 
     def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
-        """Explains a video (Eq. 14: propagated objects, then discovered ones, then the background, per frame).
+        """Explains a video.
 
         Args:
             video: RGB in [0, 1].
@@ -148,7 +149,11 @@ class Apex(SceneModel):
         return Paster(window_of(place), glimpse, self.image_size)
 
     def _roll_out(self, look_at: Tensor, follow_in: Tensor, proposals: Proposals, schedule: Schedule) -> Step:
-        """The part that depends on the frame before, frame by frame."""
+        """The part that depends on the frame before, frame by frame (Eq. 2, which is Eq. 13).
+
+        Within a frame (Eq. 14): propagated objects, then discovered ones; the background, whose posterior needs the
+        masks of both, is left to `_explain`.
+        """
         b, slots = len(look_at), self.max_objects
         state = Objects.empty(b, slots, proposals.what.shape[-1], self.hidden, proposals.what)
         valid = torch.zeros(b, slots, dtype=torch.bool, device=look_at.device)
@@ -177,6 +182,7 @@ class Apex(SceneModel):
 
             open_ = self._may_discover(carried_on, schedule).to(scope.dtype)
             prob = frame.prob * context_probability(scope, frame.claims) * open_  # Eq. 17
+            # Eq. 6: the prior of a discovery's presence, given the propagated objects
             prior = schedule["discovery_presence"] * scope_in_windows(scope, frame.rows, frame.columns) * open_
             pres = sample_presence(prob, schedule["temperature"], self.training) * open_
             top = prob.detach().topk(self.render_top, dim=1).indices
@@ -192,6 +198,7 @@ class Apex(SceneModel):
                     torch.cat([alpha, gather_slots(frame.alpha, top)], dim=1),
                     candidates.presence,
                     exists & (candidates.presence > 0),
+                    valid,
                     beliefs,
                     prob,
                     prior,
@@ -264,10 +271,11 @@ class Apex(SceneModel):
         )
         slots = self.max_objects
         terms = {
+            # Eq. 19, and below the three factors of Eq. 4 as KL terms of Eq. 20; with the mask entropy, Eq. 22
             "nll": -log_likelihood.unflatten(0, (b, t)).sum(1),
             **kl_terms(
                 steps.propagated,
-                steps.valid[..., :slots],
+                steps.alive,
                 steps.presence[..., :slots],
                 proposals,
                 steps.discovery_prob,
@@ -302,8 +310,7 @@ class Apex(SceneModel):
         what = held(steps.what) * carried[..., None]
         blend = (masks.objects[..., None, :, :] * means).sum(2) + masks.background[..., None, :, :] * backdrop
         live = carried.sum(-1).clamp_min(1)
-        alive = steps.valid[..., : self.max_objects]
-        kept = (alive * steps.propagated.q_pres).sum() / alive.sum().clamp_min(1)
+        kept = (steps.alive * steps.propagated.q_pres).sum() / steps.alive.sum().clamp_min(1)
         return Scene(
             masks=torch.cat([objects, (1 - objects.sum(2, keepdim=True)).clamp_min(0)], dim=2),
             background=torch.arange(self.max_objects + 1, device=carried.device) == self.max_objects,

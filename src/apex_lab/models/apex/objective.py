@@ -57,10 +57,12 @@ def kl_terms(
     prior: DiscoveryPrior,
     direction: Direction,
 ) -> dict[str, Float[Tensor, "B"]]:
-    """KL terms of all foreground objects (Eq. 4-6), those of z_what and z_where weighted by presence.
+    """KL terms of all foreground objects, summed over frames (Eq. 3): their part of Eq. 20.
+
+    Those of z_what and z_where are weighted by presence, the exponents of Eq. 5 (propagated) and Eq. 6 (discovered).
 
     Args:
-        propagated, valid, presence: of the P slots; invalid slots cost nothing.
+        propagated, valid, presence: of the P slots; slots that came into the frame empty cost nothing.
         proposals, discovery_prob, discovery_prior, discovery_pres: of all D cells.
         prior: of discovered objects.
         direction: of the KL of z_what and z_where.

@@ -103,7 +103,7 @@ class Appearance(nn.Module):
 
 
 class Propagation(nn.Module):
-    """q and p of objects that existed in the frame before (apex.md, step 2; priors, "Generative side").
+    """q (Eq. 15) and p (Eq. 5) of objects that existed in the frame before.
 
     Args:
         code: length of a glimpse code.
@@ -149,13 +149,16 @@ class Propagation(nn.Module):
 
         window = window_of(before.place)
         presence = before.presence[..., None]
+        # Eq. 5: the prior sees the frame before and nothing of this one
         hidden_prior = each(self.rnn_prior, before.hidden_prior, before.what, window, presence)
 
+        # Eq. 15, last factor: z_where
         crop_code = glimpses.follow(crop_source, square_of(window))
         hidden_where = each(self.rnn_where, before.hidden_where, crop_code, before.what, window)
         q_where = gaussian_from(self.head_where(hidden_where))
         place = self.windows.propagated(before.place, q_where.sample(stochastic))
 
+        # Eq. 15, second factor: z_what
         code = glimpses.look(glimpse_source, window_of(place))
         q_flat, hidden_flat = appearance(
             code.flatten(0, 1), before.what.flatten(0, 1), before.hidden_what.flatten(0, 1)
@@ -163,6 +166,7 @@ class Propagation(nn.Module):
         q_what, hidden_what = Gaussian(*(x.unflatten(0, (b, p)) for x in q_flat)), hidden_flat.unflatten(0, (b, p))
         what = q_what.sample(stochastic)
 
+        # Eq. 15, first factor: z_pres
         hidden_pres = each(self.rnn_pres, before.hidden_pres, crop_code, what, presence)
         q_pres = torch.sigmoid(self.head_pres(hidden_pres)).squeeze(-1)
         z_pres = torch.where(valid, sample_presence(q_pres, temperature, stochastic), torch.zeros_like(q_pres))
@@ -193,7 +197,7 @@ class Proposals(NamedTuple):
 
 
 class Discovery(nn.Module):
-    """Proposals of new objects (apex.md, step 4). Nothing here depends on the frame before, so all frames run at once.
+    """Proposals of new objects (Eq. 16). Nothing here depends on the frame before, so all frames run at once.
 
     Args:
         features: F.
@@ -230,15 +234,18 @@ class Discovery(nn.Module):
         step = features.shape[-1] // self.grid
         cells = features.flatten(0, 1)[..., step // 2 :: step, step // 2 :: step]  # c_d, equally spaced
         d = self.grid**2
+        # Eq. 16, last factor: z_where
         q_where = gaussian_from(self.head_where(cells).flatten(2).transpose(1, 2))  # (B T, D, 4)
         place = self.windows.discovered(q_where.sample(stochastic))
         window = window_of(place)
 
+        # Eq. 16, second factor: z_what
         code = glimpses.look(glimpse_source.flatten(0, 1), window).flatten(0, 1)
         nothing = code.new_zeros(code.shape[0], appearance.what)
         q_what, hidden = appearance(code, nothing, code.new_zeros(code.shape[0], appearance.rnn.hidden_size))
         what = q_what.sample(stochastic).unflatten(0, (b * t, d))
 
+        # p_proposal of Eq. 17, the first factor of Eq. 16 with p_context, which the loop over time adds
         evidence = torch.cat([cells.flatten(2).transpose(1, 2), what, window], dim=-1)
         prob = torch.sigmoid(self.head_pres(evidence)).squeeze(-1)
 
@@ -266,6 +273,7 @@ def scope_in_windows(
 def context_probability(scope: Float[Tensor, "B H W"], claims: Float[Tensor, "B D H W"]) -> Float[Tensor, "B D"]:
     """p_context: share of each proposal's mask that is not yet explained, in [0, 1] (Eq. 18)."""
     claims = claims.flatten(2)
-    open_ = (claims @ scope.flatten(1)[..., None]).squeeze(-1)
+    # As one minus the explained share: with nothing propagated it is exactly one, whatever the rounding of the sums.
+    explained = (claims @ (1 - scope.flatten(1))[..., None]).squeeze(-1)
     tiny = 1e-6  # a window too small to hold a pixel centre claims nothing: its context is fully open
-    return ((open_ + tiny) / (claims.sum(-1) + tiny)).clamp(0, 1)
+    return (1 - explained / (claims.sum(-1) + tiny)).clamp_min(0)

@@ -57,7 +57,8 @@ class Step(NamedTuple):
     P propagated slots and N rendered discoveries are the R = P + N components that explain the frame.
 
     what (B, R, Z), place (B, R, 4), alpha (B, R, g, g), presence (B, R): samples; presence is zero where not valid.
-    valid (B, R).
+    valid (B, R): there is an object, and it is present.
+    alive (B, P): the slot came into the frame with an object, whether or not it is still present.
     propagated: beliefs about the P slots.
     discovery_prob, discovery_prior, discovery_pres (B, D): q, p and sample of the presence of all D cells.
     source (B, P), carried (B, P), ids (B, P): what the slots hold after filtering, as in `slots.Carried`.
@@ -68,6 +69,7 @@ class Step(NamedTuple):
     alpha: Tensor
     presence: Tensor
     valid: Bool[Tensor, "B R"]
+    alive: Bool[Tensor, "B P"]
     propagated: Beliefs
     discovery_prob: Float[Tensor, "B D"]
     discovery_prior: Float[Tensor, "B D"]

@@ -1,0 +1,30 @@
+"""What the paper states, and the schedules, at the paper's scale."""
+
+from __future__ import annotations
+
+import pytest
+
+from apex_lab import components
+from tests.models.apex.small import resolved
+
+
+def test_values_of_the_paper() -> None:
+    config = resolved("model=apex", "data=p2d", "scale=paper")
+    model = config["model"]
+    assert (model["likelihood"]["sigma_fg"], model["likelihood"]["sigma_bg"]) == (0.1, 0.04)
+    assert model["likelihood"]["mixture_over"] == "channel"
+    assert model["masks"]["outside"] == "zero"
+    assert model["kl"] == "inclusive"
+    assert config["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 1e-4}
+    assert (config["data"]["batch_size"], config["data"]["frames"], config["trainer"]["max_steps"]) == (4, 20, 40_000)
+    terms = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
+    assert config["loss"] == dict.fromkeys(terms, 1.0)  # the last one is lambda_H
+
+
+def test_schedules_at_the_paper_s_scale() -> None:
+    nodes = resolved("model=apex", "data=p2d", "scale=paper")["schedule"]
+    schedules = {name: components.build(node, f"schedule.{name}") for name, node in nodes.items()}
+    temperature, p0 = schedules["temperature"], schedules["discovery_presence"]
+    assert [temperature(s) for s in (0, 10_000, 20_000, 40_000)] == pytest.approx([1.0, 0.65, 0.3, 0.3])
+    assert [p0(s) for s in (0, 5_000, 10_000, 40_000)] == pytest.approx([0.1, 0.01, 1e-3, 1e-3])
+    assert schedules["carry"](40_000) == 1.0  # full sequences
