@@ -35,6 +35,8 @@ def mlp(sizes: Sequence[int]) -> nn.Sequential:
 class GlimpseEncoder(nn.Module):
     """CNN from a crop to a vector: strided convolutions down to 4 x 4 or less, then one linear layer.
 
+    A linear shortcut from the crop itself adds to the code, so that what a crop shows is in it from the first step on.
+
     Args:
         channels: of the crop.
         size: side of the crop in pixels.
@@ -45,14 +47,16 @@ class GlimpseEncoder(nn.Module):
     def __init__(self, channels: int, size: int, width: int, outputs: int) -> None:
         super().__init__()
         layers: list[nn.Module] = [conv_norm(channels, width)]
+        full = size
         while size > 4:
             layers.append(conv_norm(width, width, stride=2))
             size = (size + 1) // 2
         self.convs = nn.Sequential(*layers)
         self.head = nn.Sequential(nn.Linear(width * size * size, outputs), nn.CELU())
+        self.shortcut = nn.Linear(channels * full * full, outputs, bias=False)
 
     def forward(self, crops: Float[Tensor, "N C g g"]) -> Float[Tensor, "N outputs"]:
-        return self.head(self.convs(crops).flatten(1))
+        return self.head(self.convs(crops).flatten(1)) + self.shortcut(crops.flatten(1))
 
 
 class SubpixelDecoder(nn.Module):

@@ -86,20 +86,20 @@ class Appearance(nn.Module):
         super().__init__()
         self.what = what
         self.rnn = nn.GRUCell(code + what, hidden)
-        self.head = nn.Linear(hidden, 2 * what)
+        self.head = nn.Linear(hidden + code, 2 * what)
         # Start as a network without memory: then a propagated object looks just as it would if it were discovered in
         # its window, and its presence does not die before propagation has learned anything.
         with torch.no_grad():
             self.rnn.weight_ih[:, code:] = 0
             self.rnn.weight_hh.zero_()
             self.rnn.bias_ih[hidden : 2 * hidden] = -3.0  # update gate: take the new state
-            self.head.weight[:what].mul_(8.0)  # codes differ between objects from the first step on
+            self.head.weight[:what].mul_(4.0)  # codes differ between objects from the first step on
             self.head.bias[what:] = NARROW
 
     def forward(self, code: Tensor, what: Tensor, hidden: Tensor) -> tuple[Gaussian, Tensor]:
         """(N, code), (N, Z), (N, hidden) -> q(z_what), new hidden state."""
         hidden = self.rnn(torch.cat([code, what], dim=-1), hidden)
-        return gaussian_from(self.head(hidden)), hidden
+        return gaussian_from(self.head(torch.cat([hidden, code], dim=-1))), hidden
 
 
 class Propagation(nn.Module):
