@@ -55,6 +55,7 @@ class Workload:
         """One weight update: forward, loss, backward, clipping, optimiser."""
         assert self.optimizer is not None
         clock = Clock(torch.device("cpu")) if clock is None else clock
+        torch.compiler.cudagraph_mark_step_begin()  # what the last step returned is not needed any more
         self.optimizer.zero_grad(set_to_none=True)
         with self._autocast():
             loss = self.learner.training_step(self.batch, 0)
@@ -68,6 +69,7 @@ class Workload:
     @torch.inference_mode()
     def infer(self) -> Tensor:
         """Masks of the batch."""
+        torch.compiler.cudagraph_mark_step_begin()
         with self._autocast():
             return self.model(as_float(self.batch["video"]), self.learner.schedule()).masks
 
