@@ -68,6 +68,8 @@ class Apex(SceneModel):
         start_mask: output of the mask decoder at the start of training (before the normalisation's squashing). Above
             zero, windows start solid: one that reaches over background costs likelihood, so windows fit what they hold
             before masks have shapes, instead of growing over everything.
+        start_std: standard deviation of q(z_what) at the start of training. A narrow one lets codes reach the decoders
+            before noise drowns them; under the inclusive KL it costs 1 / (2 std^2) nats per dimension and object.
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
@@ -97,6 +99,7 @@ class Apex(SceneModel):
         start_size: Share = 0.25,
         start_presence: Share = 0.1,
         start_mask: float = 0.0,
+        start_std: Positive = 0.5,
     ) -> None:
         super().__init__()
         if image_size % 32 or (image_size // encoder.stride) % grid:
@@ -109,7 +112,7 @@ class Apex(SceneModel):
         self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
         self.encoder, self.glimpses, self.background = encoder, glimpses, background
         windows = Windows(grid, reach, size_step, centre_step)
-        self.appearance = Appearance(hidden, what, hidden)
+        self.appearance = Appearance(hidden, what, hidden, start_std)
         self.propagation = Propagation(hidden, what, hidden, windows)
         self.discovery = Discovery(
             encoder.features, grid, what, hidden, windows, size_logit(start_size), start_presence

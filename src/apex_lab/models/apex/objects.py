@@ -5,6 +5,7 @@ Symbols as in apex.md: z_what (appearance and mask), z_where (window), z_pres (p
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -18,8 +19,7 @@ from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian, gaussian_from, relaxed_bernoulli
 
 NARROW = -3.0
-"""Where heads start the softplus of a standard deviation: at 0.05, so that what a window shows reaches the decoders
-before noise drowns it."""
+"""Where heads start the softplus of z_where's standard deviation: at 0.05, under two pixels of 64 for a centre."""
 
 
 class Objects(NamedTuple):
@@ -81,7 +81,7 @@ def _set_last_bias(network: nn.Sequential, values: Float[Tensor, "n"], shrink: f
 class Appearance(nn.Module):
     """q(z_what): one RNN on [glimpse code, z_what_{t-1}], shared by propagation and discovery (z_what_0 = 0)."""
 
-    def __init__(self, code: int, what: int, hidden: int) -> None:
+    def __init__(self, code: int, what: int, hidden: int, start_std: float) -> None:
         super().__init__()
         self.what = what
         self.rnn = nn.GRUCell(code + what, hidden)
@@ -93,7 +93,7 @@ class Appearance(nn.Module):
             self.rnn.weight_hh.zero_()
             self.rnn.bias_ih[hidden : 2 * hidden] = -3.0  # update gate: take the new state
             self.head.weight[:what].mul_(4.0)  # codes differ between objects from the first step on
-            self.head.bias[what:] = NARROW
+            self.head.bias[what:] = math.log(math.expm1(start_std))  # the softplus's inverse
 
     def forward(self, code: Tensor, what: Tensor, hidden: Tensor) -> tuple[Gaussian, Tensor]:
         """(N, code), (N, Z), (N, hidden) -> q(z_what), new hidden state."""
