@@ -17,10 +17,9 @@ from apex_lab.models.apex.windows import Windows, square_of, window_of
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian, gaussian_from, relaxed_bernoulli
 
-
 NARROW = -3.0
-"""Where heads start the softplus of a standard deviation: at 0.05, so that what a window shows reaches the decoders before
-noise drowns it."""
+"""Where heads start the softplus of a standard deviation: at 0.05, so that what a window shows reaches the decoders
+before noise drowns it."""
 
 
 class Objects(NamedTuple):
