@@ -82,7 +82,7 @@ def test_nothing_in_the_training_step_waits_for_the_device(words: tuple[str, ...
     step()
     before = [p.detach().clone() for p in work.model.parameters()]
     assert work.optimizer is not None
-    # as Lightning configures it on a GPU: Adam's step count is a tensor there
+    # without the optimiser, which reads its step counts; they lie on the host, so that waits for nothing on a GPU
     with no_synchronisation():
         work.optimizer.zero_grad(set_to_none=True)
         loss = work.learner.training_step(work.batch, 0)

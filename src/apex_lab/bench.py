@@ -60,7 +60,9 @@ class Bench:
         """The JSON file."""
         if self.asked.output is not None:
             return Path(self.asked.output)
-        return Path(self.job.config.paths.outputs) / "bench" / f"{group_name(self.job)}.json"
+        return (
+            Path(self.job.config.paths.outputs) / "bench" / f"{group_name(self.job)}_seed_{self.job.config.seed}.json"
+        )
 
     def batch(self, device: str, mode: Mode = "eager") -> tuple[int, int]:
         """Videos and frames that are timed on a device."""
@@ -139,7 +141,9 @@ def bench(asked: Bench) -> None:
         result["rows"].append(row)
         console.say(report.line(row))
     if asked.asked.memory and "cpu" in devices and build_model(config).needs_training:
-        whole = Case(config, "cpu", "eager", True, config.data["batch_size"], config.data["frames"], 0, 1)
+        whole = Case(
+            config, "cpu", "eager", True, config.data["batch_size"], config.data["frames"], 0, 1, by_part=False
+        )
         result["whole_batch"] = in_child(measure, whole)
         console.say(report.whole_batch(result["whole_batch"]))
     if asked.asked.compare and isinstance(build_model(config), Apex):

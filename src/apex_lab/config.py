@@ -77,6 +77,7 @@ class Config(_Part):
     optimizer: dict[str, Any] | None
     schedule: dict[str, dict[str, Any]]
     loss: dict[str, float | dict[str, Any]]
+    lr_scale: float | dict[str, Any]
     data: dict[str, Any]
     trainer: TrainerPart
     logger: dict[str, dict[str, Any]]
@@ -210,10 +211,17 @@ def build_schedules(config: Config) -> dict[str, Callable[[int], float]]:
 
 def build_weights(config: Config) -> dict[str, Callable[[int], float]]:
     """Loss term -> its weight as a schedule; a number is a weight that never changes."""
-    return {
-        name: components.build(value, f"loss.{name}") if isinstance(value, dict) else Constant(value)
-        for name, value in config.loss.items()
-    }
+    return {name: _build_value(value, f"loss.{name}") for name, value in config.loss.items()}
+
+
+def build_lr_scale(config: Config) -> Callable[[int], float]:
+    """What the learning rate is multiplied by, as a schedule."""
+    return _build_value(config.lr_scale, "lr_scale")
+
+
+def _build_value(value: float | dict[str, Any], key: str) -> Callable[[int], float]:
+    """A schedule; a number is one that never changes."""
+    return components.build(value, key) if isinstance(value, dict) else Constant(value)
 
 
 def _check_components(config: Config) -> None:
@@ -226,11 +234,14 @@ def _check_components(config: Config) -> None:
             raise UserError(f"optimizer.lr = {rate} is wrong: a learning rate is above 0.")
     for name, node in config.schedule.items():
         components.check(node, f"schedule.{name}")
-    for name, weight in config.loss.items():
-        if isinstance(weight, dict):
-            if not is_node(weight):
-                raise UserError(f"loss.{name} = {shown(weight)} is wrong: give a number or a schedule with a _target_.")
-            components.check(weight, f"loss.{name}")
+    for key, value in {
+        **{f"loss.{name}": value for name, value in config.loss.items()},
+        "lr_scale": config.lr_scale,
+    }.items():
+        if isinstance(value, dict):
+            if not is_node(value):
+                raise UserError(f"{key} = {shown(value)} is wrong: give a number or a schedule with a _target_.")
+            components.check(value, key)
     for name, node in config.logger.items():
         components.check(node, f"logger.{name}", supplied=["run"])
     for name, node in config.callbacks.items():
@@ -244,10 +255,12 @@ def _check_objective(config: Config) -> None:
     components.build(config.data, "data")
     for name, node in config.callbacks.items():
         components.build(node, f"callbacks.{name}")
-    for kind, given in (("schedule", schedules), ("loss", weights)):
-        for name, value in given.items():
-            if not callable(value):
-                raise UserError(f"{kind}.{name} is not a schedule: choose one of apex_lab.schedules.")
+    values = {f"schedule.{name}": value for name, value in schedules.items()}
+    values |= {f"loss.{name}": value for name, value in weights.items()}
+    values["lr_scale"] = build_lr_scale(config)
+    for key, value in values.items():
+        if not callable(value):
+            raise UserError(f"{key} is not a schedule: choose one of apex_lab.schedules.")
     _same_names("schedule", schedules, getattr(model, "schedule_names", ()))
     _same_names("loss", weights, getattr(model, "term_names", ()))
     if model.needs_training:

@@ -22,12 +22,15 @@ from apex_lab.errors import UserError
 from apex_lab.metrics import SceneMetrics, scene_identities
 from apex_lab.metrics.scenes import background_identities
 from apex_lab.scene import Scene, SceneModel, Schedule
+from apex_lab.schedules import Constant
 
 Batch = Mapping[str, Any]
 """`video` uint8 (B, T, 3, H, W), `segmentation` uint8 (B, T, H, W), `index` int (B,)."""
 
 Values = Mapping[str, Callable[[int], float]]
 """Name -> schedule."""
+
+UNSCALED = Constant(1.0)
 
 
 class Learner(L.LightningModule):
@@ -38,6 +41,7 @@ class Learner(L.LightningModule):
         optimizer: weights -> optimiser over them.
         schedules: the values that the model's forward takes.
         weights: loss term -> its weight.
+        lr_scale: what the optimiser's learning rate is multiplied by.
         seed: of the noise.
         gradient_clip_norm: gradients are scaled down to this norm; None leaves them.
         log_interval: steps between two logged steps.
@@ -54,6 +58,7 @@ class Learner(L.LightningModule):
         gradient_clip_norm: float | None = None,
         log_interval: int = 1,
         step: int = 0,
+        lr_scale: Callable[[int], float] = UNSCALED,
     ) -> None:
         super().__init__()
         self.model = model
@@ -66,13 +71,17 @@ class Learner(L.LightningModule):
         self._weights = weights
         self._clip_norm = gradient_clip_norm
         self._log_interval = log_interval
+        self._lr_scale = lr_scale
         self._validation = SceneMetrics()
         self._validation_sums: dict[str, Tensor] = {}
         self._validation_videos = 0
         self._clock, self._frames = 0.0, 0
 
     def configure_optimizers(self) -> Optimizer:
-        return self._optimizer([p for p in self.model.parameters() if p.requires_grad])
+        optimizer = self._optimizer([p for p in self.model.parameters() if p.requires_grad])
+        for group in optimizer.param_groups:
+            group.setdefault("initial_lr", group["lr"])  # the name that PyTorch's schedulers store it under, too
+        return optimizer
 
     def schedule(self) -> Schedule:
         """The scheduled values at this step; filled on the device, so that nothing waits for a copy."""
@@ -111,8 +120,13 @@ class Learner(L.LightningModule):
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         """One weight update and, every `log_interval` updates, its row in the curves."""
+        optimizer = self.optimizers(use_pl_optimizer=False)
+        assert isinstance(optimizer, Optimizer)
+        for group in optimizer.param_groups:
+            group["lr"] = group["initial_lr"] * self._lr_scale(self.step)
         super().optimizer_step(*args, **kwargs)
         values = {name: value(self.step) for name, value in self._schedules.items()}
+        values["lr_scale"] = self._lr_scale(self.step)
         self.step += 1
         if self.step % self._log_interval == 0 or self.step == 1:
             row = self.fetch()

@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import Logger
 from apex_lab import callbacks, checkpoints, cli, components, console, estimate, evaluation
 from apex_lab.config import (
     Job,
+    build_lr_scale,
     build_model,
     build_optimizer,
     build_schedules,
@@ -133,6 +134,7 @@ def _fit(
         gradient_clip_norm=settings.gradient_clip_norm,
         log_interval=settings.log_interval,
         step=start,
+        lr_scale=build_lr_scale(config),
     )
     if settings.compile:
         model.compile()

@@ -37,7 +37,12 @@ VIDEO = torch.rand(3, 4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
 
 @pytest.mark.parametrize(
     "words",
-    [(), ("+ablation=image_stn",), ("+ablation=gaussian_scalor_norm",), ("model.likelihood.mixture_over=pixel",)],
+    [
+        (),
+        ("+ablation=image_stn",),
+        pytest.param(("+ablation=gaussian_scalor_norm",), marks=pytest.mark.slow),
+        pytest.param(("model.likelihood.mixture_over=pixel",), marks=pytest.mark.slow),
+    ],
     ids=" ".join,
 )
 def test_the_variant_gives_the_same_terms_masks_and_gradients(words: tuple[str, ...]) -> None:

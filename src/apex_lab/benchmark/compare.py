@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import statistics
+import time
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,7 +57,10 @@ def straightforward(config: Config, model: Apex, render_top: int | None) -> Stra
 
 
 def compare(asked: Comparison) -> dict[str, Any]:
-    """Frames per second of APEX and of both variants, and the ratios, round by round."""
+    """Frames per second of APEX and of both variants, and the ratios, round by round.
+
+    On the CPU the ratios are told once more in processor time, which other programs on the machine disturb less.
+    """
     device = torch.device(asked.device)
 
     def work(model: Apex | None) -> Workload:
@@ -71,13 +75,16 @@ def compare(asked: Comparison) -> dict[str, Any]:
     }
     steps = {name: each.step(training=True) for name, each in works.items()}
     seconds: dict[str, list[float]] = {name: [] for name in works}
+    processor: dict[str, list[float]] = {name: [] for name in works}
     with torch.random.fork_rng(devices=[]):
         for i in range(asked.warmup + asked.repeats):
             for name, step in steps.items():
+                began = time.process_time()
                 passed = once(step, device)
                 if i >= asked.warmup:
                     seconds[name].append(passed)
-    ratios = {name: [b / a for a, b in zip(seconds["apex"], seconds[name], strict=True)] for name in works}
+                    processor[name].append(time.process_time() - began)
+    ratios, in_processor_time = ({n: _ratios(times["apex"], times[n]) for n in works} for times in (seconds, processor))
     return {
         "device": asked.device,
         "batch_size": asked.batch_size,
@@ -88,7 +95,16 @@ def compare(asked: Comparison) -> dict[str, Any]:
                 **spread(seconds[name], fast.frames),
                 "apex_trains_times_as_many": statistics.median(ratios[name]),
                 "times_min_max": [min(ratios[name]), max(ratios[name])],
+                "times_in_processor_time": statistics.median(in_processor_time[name])
+                if asked.device == "cpu"
+                else None,
+                "processor_seconds": statistics.median(processor[name]),
             }
             for name in works
         },
     }
+
+
+def _ratios(ours: list[float], theirs: list[float]) -> list[float]:
+    """Round by round, how many times as long theirs took."""
+    return [b / a for a, b in zip(ours, theirs, strict=True)]

@@ -34,6 +34,7 @@ class Case:
         training: a training step, or an inference.
         batch_size, frames: of the batch.
         warmup, repeats: steps before and during the measurement.
+        by_part: seconds by part too, which takes as many steps again.
     """
 
     config: Config
@@ -44,6 +45,7 @@ class Case:
     frames: int
     warmup: int
     repeats: int
+    by_part: bool = True
 
 
 def measure(case: Case) -> dict[str, Any]:
@@ -80,7 +82,7 @@ def measure(case: Case) -> dict[str, Any]:
     if case.mode != "eager":
         row["graph_breaks"] = sum(counters["graph_break"].values())
         row["graphs"] = counters["stats"]["unique_graphs"]
-    else:
+    elif case.by_part:
         row["parts"] = parts(work, case)
     if device.type == "cuda":
         row |= kernels(step)

@@ -55,7 +55,9 @@ def comparison(compared: Row) -> str:
         said.append(
             f"{compared['device']}: APEX trains {found['apex_trains_times_as_many']:.2f} times as many frames/s as "
             f'the variant "{variant}" ({low:.2f} to {high:.2f}; {" and ".join(both)}; '
-            f"batch {compared['batch_size']} x {compared['frames']} frames)"
+            f"batch {compared['batch_size']} x {compared['frames']} frames"
+            + ("" if (of := found["times_in_processor_time"]) is None else f"; {of:.2f} in processor time")
+            + ")"
         )
     return "\n".join(said)
 

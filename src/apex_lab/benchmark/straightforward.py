@@ -94,9 +94,9 @@ class Straightforward(Apex):
     def _sources(self, video: Tensor, i: int, memory: _Memory) -> tuple[Tensor, Tensor, Tensor]:
         """What is looked at in this frame and what is followed, (B, C, h, w), and its features (B, 1, F, h, w)."""
         lstm = self.encoder.over_time
-        driven = lstm.from_input(self.encoder.dla(video[:, i] - 0.5))
-        memory.hidden, memory.cell = lstm.step(driven, memory.hidden, memory.cell)
-        features = memory.hidden[:, None]
+        frame = self.encoder.of_images(video[:, i])
+        memory.hidden, memory.cell = lstm.step(lstm.from_input(frame), memory.hidden, memory.cell)
+        features = (frame + memory.hidden)[:, None]
         before = features if memory.features is None else memory.features
         memory.features = features
         pair = torch.cat([before, features], dim=1)
@@ -138,6 +138,7 @@ class Straightforward(Apex):
         candidates = Objects.join(before, self._found(cells, pres, top))
         exists = torch.cat([memory.valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
         kept = carry(candidates.presence, exists, memory.ids, memory.next_id, self.keep_threshold)
+        alive = memory.valid
         self._remember(memory, candidates, kept, schedule)
         return Step(
             candidates.what,
@@ -145,6 +146,7 @@ class Straightforward(Apex):
             torch.cat([alpha, gather_slots(alphas, top)], dim=1),
             candidates.presence,
             exists & (candidates.presence > 0),
+            alive,
             beliefs,
             prob,
             prior,
@@ -176,7 +178,7 @@ class Straightforward(Apex):
             "nll": -log_likelihood,
             **kl_terms(
                 steps.propagated,
-                steps.valid[..., :slots],
+                steps.alive,
                 steps.presence[..., :slots],
                 proposals,
                 steps.discovery_prob,

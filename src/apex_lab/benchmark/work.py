@@ -21,7 +21,7 @@ class Workload:
         config: the run whose steps are measured; schedules stand where they are in the middle of it.
         device: where.
         batch_size, frames: of the batch; its images are as large as `data.image_size`.
-        model: what to measure; by default what the configuration builds.
+        model: what to measure, as it is; by default what the configuration builds, as training from scratch begins.
     """
 
     def __init__(
@@ -34,7 +34,8 @@ class Workload:
         self.frames = batch_size * frames
         self.batch = {"video": video.to(device)}
         self.model = build_model(config) if model is None else model
-        self.model.initialise(as_float(video).mean((0, 1)))
+        if model is None:
+            self.model.initialise(as_float(video).mean((0, 1)))
         self.learner = Learner(
             self.model,
             lambda parameters: build_optimizer(config, parameters),
@@ -55,6 +56,7 @@ class Workload:
         """One weight update: forward, loss, backward, clipping, optimiser."""
         assert self.optimizer is not None
         clock = Clock(torch.device("cpu")) if clock is None else clock
+        torch.compiler.cudagraph_mark_step_begin()  # what the last step returned is not needed any more
         self.optimizer.zero_grad(set_to_none=True)
         with self._autocast():
             loss = self.learner.training_step(self.batch, 0)
@@ -68,6 +70,7 @@ class Workload:
     @torch.inference_mode()
     def infer(self) -> Tensor:
         """Masks of the batch."""
+        torch.compiler.cudagraph_mark_step_begin()
         with self._autocast():
             return self.model(as_float(self.batch["video"]), self.learner.schedule()).masks
 

@@ -84,6 +84,13 @@ class SubpixelDecoder(nn.Module):
         self.blocks = nn.Sequential(*blocks)
         self.head = nn.Sequential(nn.Conv2d(width, 4 * outputs, 3, padding=1), nn.PixelShuffle(2))
 
+    def start_at(self, value: float) -> None:
+        """Sets the last bias, so that an untrained decoder's pictures vary around `value`."""
+        last = self.head[0]
+        assert isinstance(last, nn.Conv2d)
+        assert last.bias is not None
+        nn.init.constant_(last.bias, value)
+
     def forward(self, latent: Float[Tensor, "N latent"]) -> Float[Tensor, "N outputs size size"]:
         return self.head(self.blocks(self.stem(latent)))
 

@@ -40,9 +40,12 @@ class ApexEncoder(nn.Module):
         nn.init.normal_(self.colour.weight)
         self.over_time = ConvLSTM(features)
 
+    def of_images(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N F H/4 W/4"]:
+        """RGB in [0, 1] -> features of each frame by itself."""
+        centred = images - 0.5
+        return self.dla(centred) + self.colour(F.avg_pool2d(centred, self.stride))
+
     def forward(self, video: Float[Tensor, "B T 3 H W"]) -> Float[Tensor, "B T F H/4 W/4"]:
         """RGB in [0, 1] -> features; the DLA sees all B T frames as one batch."""
-        image = video.flatten(0, 1) - 0.5
-        frames = self.dla(image) + self.colour(F.avg_pool2d(image, self.stride))
-        frames = frames.unflatten(0, video.shape[:2])
+        frames = self.of_images(video.flatten(0, 1)).unflatten(0, video.shape[:2])
         return frames + self.over_time(frames)

@@ -7,7 +7,7 @@ from typing import Annotated
 import torch
 from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
 from apex_lab.models.apex.background import Background
 from apex_lab.models.apex.encoder import ApexEncoder
@@ -118,7 +118,7 @@ class Apex(SceneModel):
         self.colour_decoder = SubpixelDecoder(what, glimpse_size, decoder_width, 3)
         # Last, so that all other weights start at the same values whatever the glimpses are cut from.
         self.glimpses.build(encoder.features, hidden)
-        nn.init.constant_(self.mask_decoder.head[0].bias, start_mask)
+        self.mask_decoder.start_at(start_mask)
 
     def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
         """Starts the background at the training set's median."""
