@@ -67,6 +67,35 @@ def test_broadcast_decoder_and_glimpse_encoder_sizes() -> None:
     assert group_norm(30)(torch.randn(1, 30, 2, 2)).shape == (1, 30, 2, 2)
 
 
+@torch.no_grad()
+def test_a_crop_s_code_is_that_of_its_convolutions_and_a_weighted_sum_of_its_pixels() -> None:
+    torch.manual_seed(2)
+    net = GlimpseEncoder(2, 6, 8, 5).double()
+    crops = torch.randn(3, 2, 6, 6, dtype=torch.float64)
+    weights = net.shortcut.weight.tolist()
+    sums = torch.zeros(3, 5, dtype=torch.float64)
+    for n, crop in enumerate(crops.tolist()):
+        pixels = [value for channel in crop for row in channel for value in row]
+        for k in range(5):
+            sums[n, k] = sum(w * value for w, value in zip(weights[k], pixels, strict=True))
+    features = net.convs(crops).flatten(1) @ net.head[0].weight.T + net.head[0].bias
+    seen = torch.where(features > 0, features, features.exp() - 1)  # CELU
+    for part in (seen, sums):
+        assert part.std() > 0.1
+    torch.testing.assert_close(net(crops), seen + sums, rtol=0, atol=1e-12)
+
+
+@torch.no_grad()
+def test_the_shortcut_of_a_crop_is_linear_and_has_no_bias() -> None:
+    net = GlimpseEncoder(3, 8, 4, 5).double()
+    for p in net.head.parameters():
+        p.zero_()
+    a, b = torch.randn(2, 1, 3, 8, 8, dtype=torch.float64)
+    assert (net(0 * a) == 0).all()
+    torch.testing.assert_close(net(2 * a - 3 * b), 2 * net(a) - 3 * net(b))
+    assert net(a).abs().sum() > 0
+
+
 def test_conv_lstm_against_loops_over_channels_and_pixels() -> None:
     """Gates as sums over the 3 x 3 neighbourhood of inputs and of the hidden state before."""
     torch.manual_seed(1)

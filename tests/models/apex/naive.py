@@ -147,7 +147,7 @@ def propagate(model: Apex, e: Tensor, thing: Thing, told: Told) -> Thing:
 
     code = glimpses.glimpse(cut(e, moved.window, glimpses.size)[None])[0]
     what = recur(model.appearance.rnn, thing.hidden["what"], code, thing.what)
-    q_what = normal(model.appearance.head(what))
+    q_what = normal(model.appearance.head(torch.cat([what, code])))
     pres = recur(net.rnn_pres, thing.hidden["pres"], c_p, q_what[0], presence)
     q_pres = float(torch.sigmoid(net.head_pres(pres)))
 
@@ -184,7 +184,7 @@ def discover(model: Apex, e: Tensor, scope: Tensor, p0: float, told: Told) -> li
             code = glimpses.glimpse(cut(e, thing.window, glimpses.size)[None])[0]
             what_0 = torch.zeros(model.appearance.what, dtype=torch.float64)
             thing.hidden = hidden | {"what": recur(model.appearance.rnn, nothing, code, what_0)}
-            q_what = normal(model.appearance.head(thing.hidden["what"]))
+            q_what = normal(model.appearance.head(torch.cat([thing.hidden["what"], code])))
             thing.what = q_what[0]
             proposal = torch.sigmoid(net.head_pres(torch.cat([c_d, thing.what, thing.window])))
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import functools
+import zlib
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from hydra import compose, initialize_config_dir
+from torch import Tensor, nn
 
 from apex_lab.config import conf_dir, plain
 from apex_lab.models.apex import (
@@ -39,7 +43,11 @@ def parts() -> dict[str, Any]:
 
 
 def tiny(**changes: object) -> Apex:
-    """APEX with every part at its smallest; random weights spread so that all presences occur."""
+    """APEX with every part at its smallest, as it starts, but with presences that occur.
+
+    About half of the cells of discovery are present (all or none for a `start_presence` near one or zero), and of the
+    propagated objects most.
+    """
     torch.manual_seed(0)
     sizes: dict[str, Any] = {
         "what": 6,
@@ -51,34 +59,105 @@ def tiny(**changes: object) -> Apex:
         "decoder_width": 4,
         "start_presence": 0.5,
     }
-    model = Apex(SIZE, **(parts() | sizes | changes))
+    chosen = sizes | changes
+    model = Apex(SIZE, **(parts() | chosen))
+    start = torch.logit(torch.tensor(chosen["start_presence"])).item()
+    spread(model.discovery.head_pres[-1], 20 * start, 4.0, functools.partial(propose, model))
     with torch.no_grad():
-        for p in model.discovery.head_pres.parameters():
-            p.mul_(20.0)
+        model.propagation.head_pres[-1].bias.fill_(1.5)
     return model
 
 
 def lively(**changes: object) -> Apex:
-    """A tiny model whose objects move, cover each other, vanish and make room for others."""
-    model = tiny(**changes)
-    with torch.no_grad():
-        model.encoder.over_time.from_input.weight.mul_(3.0)
-        model.propagation.head_where[-1].weight.mul_(30.0)
-        for prior in (model.propagation.prior_pres, model.propagation.prior_where, model.propagation.prior_what):
-            prior[-1].weight.mul_(30.0)
-        for decoder in (model.mask_decoder, model.colour_decoder):
-            decoder.head[0].weight.mul_(5.0)
-            decoder.head[0].bias.add_(0.5)
-        # Presence: spread out, and centred so that about half of the objects vanish from frame to frame.
-        head = model.propagation.head_pres
-        head[-1].weight.mul_(1000.0)
-        head[-1].bias.fill_(100.0)
-        said: list[torch.Tensor] = []
-        hook = head.register_forward_hook(lambda module, inputs, output: said.append(output))
-        model.eval()(video(2, 5), SCHEDULE)
-        hook.remove()
-        head[-1].bias.sub_(torch.stack(said[1:]).median())
+    """A tiny model whose objects move, cover each other, vanish and make room for others, whatever it starts as.
+
+    All weights are drawn anew, so every network says something and has a memory; then the last layer of every head, in
+    the order in which they are asked, is scaled to say what is written here about a video.
+    """
+    model = copy.deepcopy(_lively(**changes))
+    torch.manual_seed(0)  # the same noise after it whether or not it was made before
     return model
+
+
+@functools.cache
+def _lively(**changes: object) -> Apex:
+    model = tiny(**changes)
+    redraw(model)
+    discovery, propagation, what = model.discovery, model.propagation, model.appearance.what
+    discover, roll_out = functools.partial(propose, model), functools.partial(follow, model)
+    # means and standard deviations of what the heads say: of latents' means, then of their raw standard deviations
+    spread(discovery.head_where, [-0.8, -0.8, 0.0, 0.0, *[-2.0] * 4], 0.5, discover)
+    spread(model.appearance.head, [0.0] * what + [-2.0] * what, [1.0] * what + [0.5] * what, discover)
+    spread(discovery.head_pres[-1], 0.0, 4.0, discover)
+    found = discover().what.flatten(0, 2)
+    spread(model.mask_decoder.head[0], 0.5, 1.0, lambda: model.mask_decoder(found))
+    spread(model.colour_decoder.head[0], 0.0, 1.5, lambda: model.colour_decoder(found))
+    spread(propagation.head_where[-1], [0.0] * 4 + [-2.0] * 4, [1.0] * 4 + [0.5] * 4, roll_out)
+    for _ in range(3):  # about half of the objects vanish; who does decides who is asked next
+        spread(propagation.head_pres[-1], 0.0, 4.0, roll_out)
+    spread(propagation.prior_pres[-1], 0.0, 2.0, roll_out)
+    spread(propagation.prior_where[-1], [0.0] * 4 + [-2.0] * 4, 0.5, roll_out)
+    spread(propagation.prior_what[-1], [0.0] * what + [-1.0] * what, 0.5, roll_out)
+    return model
+
+
+def redraw(model: nn.Module) -> None:
+    """Draws every weight anew, from its name, at a scale that keeps signals at theirs: nothing of a start remains."""
+    norms = {f"{name}.weight" for name, part in model.named_modules() if isinstance(part, nn.GroupNorm)}
+    with torch.no_grad():
+        for name, p in model.named_parameters():
+            noise = torch.randn(p.shape, generator=torch.Generator().manual_seed(zlib.crc32(name.encode())))
+            if p.dim() == 1 or name.endswith("bias_image"):
+                p.copy_(0.3 * noise + (1.0 if name in norms else 0.0))
+            else:
+                p.copy_(noise / p[0].numel() ** 0.5)
+
+
+@torch.no_grad()
+def propose(model: Apex) -> Proposals:
+    """What discovery proposes in two videos; the means."""
+    x = video(2, 5)
+    features = model.encoder(x)
+    look_at, _ = model.glimpses.sources(x, features)
+    return model.discovery(features, look_at, model.glimpses, model.appearance, False)
+
+
+@torch.no_grad()
+def follow(model: Apex) -> Step:
+    """What the loop over time leaves of two videos in evaluation."""
+    training = model.training
+    steps = Inside(model.eval(), video(2, 5)).steps
+    model.train(training)
+    return steps
+
+
+def spread(
+    layer: nn.Module,
+    mean: float | Sequence[float],
+    std: float | Sequence[float],
+    run: Callable[[], Proposals | Step | Tensor],
+) -> None:
+    """Scales a last layer so that each of its outputs has this mean and this standard deviation in a run.
+
+    Its first call counts, over all that it is asked about; in a run of the loop over time, where its calls are the
+    frames, what it says of slots that came into the frame with an object.
+    """
+    assert isinstance(layer, nn.Linear | nn.Conv2d)
+    assert layer.bias is not None
+    said: list[Tensor] = []
+    hook = layer.register_forward_hook(lambda module, inputs, output: said.append(output.detach()))
+    result = run()
+    hook.remove()
+    if isinstance(result, Step):
+        rows = torch.stack(said, dim=1)[result.alive]
+    else:
+        rows = said[0].movedim(1 if isinstance(layer, nn.Conv2d) else -1, -1).flatten(0, -2)
+    scale = torch.as_tensor(std) / rows.std(0)
+    shift = torch.as_tensor(mean) - scale * rows.mean(0)
+    assert scale.isfinite().all()  # it said something different each time
+    with torch.no_grad():
+        layer.weight.mul_(scale.reshape(-1, *[1] * (layer.weight.dim() - 1)))
+        layer.bias.mul_(scale).add_(shift)
 
 
 def video(b: int = 3, t: int = 4) -> torch.Tensor:

@@ -1,0 +1,76 @@
+"""What the networks say before they have learned anything; and that `lively` does not depend on it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from apex_lab.models.apex import Apex
+from tests.models.apex import small
+from tests.models.apex.small import follow, lively, propose, tiny
+
+NARROW = math.log(1 + math.exp(-3)) + 1e-3
+"""0.0496: softplus of -3, and the least standard deviation."""
+
+
+def about_narrow(std: torch.Tensor, within: float) -> None:
+    """The mean of some standard deviations, and each of them up to a factor."""
+    assert float(std.mean()) == pytest.approx(NARROW, rel=0.15)
+    assert std.min() > NARROW / within
+    assert std.max() < NARROW * within
+
+
+def test_standard_deviations_of_discovery_start_narrow() -> None:
+    found = propose(tiny())
+    about_narrow(found.q_what.std, within=2.5)
+    about_narrow(found.q_where.std, within=1.2)
+
+
+def test_standard_deviations_of_propagation_start_narrow_as_does_the_prior_of_windows() -> None:
+    steps = follow(tiny())
+    alive, beliefs = steps.alive, steps.propagated
+    assert alive.sum() > 4
+    about_narrow(beliefs.q_what.std[alive], within=2.5)
+    about_narrow(beliefs.q_where.std[alive], within=1.2)
+    about_narrow(beliefs.p_where.std[alive], within=1.2)
+
+
+def test_windows_of_propagated_objects_start_still() -> None:
+    steps = follow(tiny())
+    for belief in (steps.propagated.q_where, steps.propagated.p_where):
+        assert belief.mean[steps.alive].abs().max() < 0.1
+
+
+@pytest.mark.parametrize("start", [-2.0, 0.0, 3.0])
+def test_masks_start_at_start_mask_with_a_small_spread(start: float) -> None:
+    model = tiny(start_mask=start)
+    what = torch.randn(500, 6, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        raw = model.mask_decoder(what)
+        assert abs(float(raw.mean()) - start) < 0.1
+        assert 0.01 < float(raw.std()) < 0.5  # but not all the same: masks can learn their shapes
+        plain = tiny()
+        torch.testing.assert_close(raw, plain.mask_decoder(what) + start, rtol=0, atol=1e-5)
+        assert torch.equal(model.colour_decoder(what), plain.colour_decoder(what))
+        logits = model._alpha(propose(model).what)
+        assert abs(float(logits.mean()) - 5 * math.tanh(start)) < 0.5  # c = 5, Eq. 7
+
+
+def test_lively_is_the_same_whatever_a_model_starts_as(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other tests need objects that stay, vanish and come; a change of how networks start must not take them away."""
+    want = lively().state_dict()
+
+    def other(**changes: object) -> Apex:
+        model = tiny(start_presence=0.01, start_size=0.7, start_mask=4.0, **changes)
+        with torch.no_grad():
+            for p in model.parameters():
+                p.normal_(std=3.0)
+        return model
+
+    monkeypatch.setattr(small, "tiny", other)
+    got = small._lively.__wrapped__().state_dict()
+    assert got.keys() == want.keys()
+    for key, value in want.items():
+        assert torch.equal(value, got[key]), key
