@@ -105,11 +105,43 @@ def test_training_is_what_is_written_out_by_hand(clip: float | None) -> None:
         torch.testing.assert_close(ours_, theirs, rtol=1e-4, atol=1e-6)
 
 
+def test_the_learning_rate_follows_its_schedule_also_after_a_stop() -> None:
+    def parameters(model: torch.nn.Module) -> torch.Tensor:
+        return torch.nn.utils.parameters_to_vector(model.parameters()).detach()
+
+    scale = Linear(1.0, 0.25, steps=4, delay=1)
+    whole = learner(lr_scale=scale)
+    kept = fit(whole, 6, validate=False)
+    rates = [row["schedule/lr"] for _, row in kept.found]
+    assert rates == pytest.approx([1e-4 * scale(step) for step in range(6)])
+
+    first = learner(lr_scale=scale)
+    fit(first, 4, validate=False)
+    stored = first.optimizers(use_pl_optimizer=False).state_dict()
+
+    def restored(weights: list[torch.nn.Parameter]) -> torch.optim.Optimizer:
+        optimizer = torch.optim.SGD(weights, lr=1e-4)
+        optimizer.load_state_dict(stored)
+        return optimizer
+
+    second = Learner(first.model, restored, {"noise": Constant(1.0)}, WEIGHTS, step=4, lr_scale=scale)
+    fit(second, 2, validate=False)
+    assert torch.equal(parameters(whole.model), parameters(second.model))
+    assert not torch.equal(parameters(whole.model), parameters(constant_rate().model))
+
+
+def constant_rate() -> Learner:
+    """Six steps at one learning rate."""
+    steady = learner()
+    fit(steady, 6, validate=False)
+    return steady
+
+
 def test_a_row_has_every_term_schedule_and_diagnostic() -> None:
     kept = fit(learner(log_interval=2), 4, interval=2)
     steps = [(step, sorted(row)) for step, row in kept.found]
     train = sorted(["train/loss", "train/error", "train/spread", "train/gradient_norm", "train/frames_per_second"])
-    train = sorted([*train, "diagnostics/largest", "schedule/noise"])
+    train = sorted([*train, "diagnostics/largest", "schedule/lr", "schedule/noise"])
     val = ["loss", "error", "spread", "foreground_share", "ari", "ari_fg", "msc", "msc_fg"]
     val = sorted(f"val/{name}" for name in val)
     assert steps == [(1, train), (2, train), (2, val), (4, train), (4, val)]

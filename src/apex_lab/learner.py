@@ -126,7 +126,7 @@ class Learner(L.LightningModule):
             group["lr"] = group["initial_lr"] * self._lr_scale(self.step)
         super().optimizer_step(*args, **kwargs)
         values = {name: value(self.step) for name, value in self._schedules.items()}
-        values["lr_scale"] = self._lr_scale(self.step)
+        values["lr"] = optimizer.param_groups[0]["lr"]
         self.step += 1
         if self.step % self._log_interval == 0 or self.step == 1:
             row = self.fetch()

@@ -12,29 +12,31 @@ from tests.models.apex import small
 from tests.models.apex.small import follow, lively, propose, tiny
 
 NARROW = math.log(1 + math.exp(-3)) + 1e-3
-"""0.0496: softplus of -3, and the least standard deviation."""
+"""0.0496: softplus of -3, and the least standard deviation; where z_where starts."""
 
 
-def about_narrow(std: torch.Tensor, within: float) -> None:
+def about(std: torch.Tensor, start: float, within: float) -> None:
     """The mean of some standard deviations, and each of them up to a factor."""
-    assert float(std.mean()) == pytest.approx(NARROW, rel=0.15)
-    assert std.min() > NARROW / within
-    assert std.max() < NARROW * within
+    assert float(std.mean()) == pytest.approx(start, rel=0.15)
+    assert std.min() > start / within
+    assert std.max() < start * within
 
 
-def test_standard_deviations_of_discovery_start_narrow() -> None:
-    found = propose(tiny())
-    about_narrow(found.q_what.std, within=2.5)
-    about_narrow(found.q_where.std, within=1.2)
+@pytest.mark.parametrize("start", [0.05, 0.3, 1.5])
+def test_standard_deviations_of_discovery_start_where_they_should(start: float) -> None:
+    found = propose(tiny(start_std=start))
+    about(found.q_what.std, start, within=2.5)
+    about(found.q_where.std, NARROW, within=1.2)
 
 
-def test_standard_deviations_of_propagation_start_narrow_as_does_the_prior_of_windows() -> None:
-    steps = follow(tiny())
+@pytest.mark.parametrize("start", [0.05, 0.3])
+def test_standard_deviations_of_propagation_start_where_they_should_as_does_the_prior_of_windows(start: float) -> None:
+    steps = follow(tiny(start_std=start))
     alive, beliefs = steps.alive, steps.propagated
     assert alive.sum() > 4
-    about_narrow(beliefs.q_what.std[alive], within=2.5)
-    about_narrow(beliefs.q_where.std[alive], within=1.2)
-    about_narrow(beliefs.p_where.std[alive], within=1.2)
+    about(beliefs.q_what.std[alive], start, within=2.5)
+    about(beliefs.q_where.std[alive], NARROW, within=1.2)
+    about(beliefs.p_where.std[alive], NARROW, within=1.2)
 
 
 def test_windows_of_propagated_objects_start_still() -> None:
