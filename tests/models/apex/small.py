@@ -27,7 +27,9 @@ from apex_lab.models.apex.rollout import Step
 from apex_lab.scene import Scene, schedule_at
 
 SIZE = 32
-SCHEDULE = schedule_at({"temperature": 0.7, "discovery_presence": 0.1, "carry": 1.0, "discover": 0.8})
+SCHEDULE = schedule_at(
+    {"temperature": 0.7, "discovery_presence": 0.1, "carry": 1.0, "discover": 0.8, "sigma_bg_scale": 1.0}
+)
 
 
 def parts() -> dict[str, Any]:

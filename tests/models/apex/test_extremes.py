@@ -14,7 +14,9 @@ from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.scene import schedule_at
 from tests.models.apex.small import SIZE, tiny, video
 
-COLD = schedule_at({"temperature": 0.3, "discovery_presence": 1e-3, "carry": 1.0, "discover": 0.5})
+COLD = schedule_at(
+    {"temperature": 0.3, "discovery_presence": 1e-3, "carry": 1.0, "discover": 0.5, "sigma_bg_scale": 1.0}
+)
 
 
 def push(head: nn.Module, value: float) -> None:

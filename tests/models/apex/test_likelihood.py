@@ -111,3 +111,21 @@ def test_pixels_without_any_object_are_the_background_s_and_give_objects_no_grad
     assert (leaves[0].grad == 0).all()
     assert (leaves[1].grad == 0).all()
     assert (leaves[3].grad != 0).any()
+
+
+@pytest.mark.parametrize("over", ["channel", "pixel"])
+def test_scale_bg_multiplies_sigma_bg_in_value_and_gradient(over: str) -> None:
+    found = []
+    for likelihood, scale in (
+        (MixtureLikelihood(0.4, 0.2, over), torch.tensor(1.6)),  # type: ignore[arg-type]
+        (MixtureLikelihood(0.4, 0.2 * 1.6, over), None),  # type: ignore[arg-type]
+    ):
+        leaves = [x.clone().requires_grad_() for x in case()]
+        out = likelihood(*leaves, scale)
+        found.append([out, *torch.autograd.grad(out.sum(), leaves)])
+    for scaled, wide in zip(*found, strict=True):
+        torch.testing.assert_close(scaled, wide, rtol=1e-6, atol=1e-6)
+
+
+def test_one_gaussian_has_no_background_to_widen() -> None:
+    assert torch.equal(GaussianLikelihood()(*case(), torch.tensor(3.0)), GaussianLikelihood()(*case()))

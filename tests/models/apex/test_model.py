@@ -217,3 +217,14 @@ def test_refusals() -> None:
         Apex(48, **parts())
     with pytest.raises(ValueError, match="built for 32 px"):
         tiny()(torch.rand(1, 2, 3, 64, 64), SCHEDULE)
+
+
+def test_sigma_bg_scale_widens_the_background_of_the_whole_model() -> None:
+    def terms(sigma_bg: float, scale: float) -> dict[str, torch.Tensor]:
+        model = tiny(likelihood=MixtureLikelihood(0.1, sigma_bg)).eval()
+        return model(video(), {**SCHEDULE, "sigma_bg_scale": torch.tensor(scale)}).terms
+
+    scaled, wide, narrow = terms(0.05, 1.6), terms(0.08, 1.0), terms(0.05, 1.0)
+    for name, value in wide.items():
+        torch.testing.assert_close(scaled[name], value, rtol=1e-5, atol=1e-3)
+    assert not torch.allclose(scaled["nll"], narrow["nll"])

@@ -92,7 +92,12 @@ def ideal(masks: MaskNormalisation | None = None, stop_at: int | None = None) ->
 
 
 def follow(model: Apex, x: Tensor) -> Scene:
-    return model(x, schedule_at({"temperature": 0.1, "discovery_presence": 1e-3, "carry": 1.0, "discover": 0.0}))
+    return model(
+        x,
+        schedule_at(
+            {"temperature": 0.1, "discovery_presence": 1e-3, "carry": 1.0, "discover": 0.0, "sigma_bg_scale": 1.0}
+        ),
+    )
 
 
 @pytest.mark.parametrize("masks", [None, ScalorNormalisation()])

@@ -14,9 +14,10 @@ from torch import Tensor
 Sigma = Annotated[float, Field(gt=0, le=10)]
 
 
-def log_normal(x: Tensor, mean: Tensor, sigma: float) -> Tensor:
+def log_normal(x: Tensor, mean: Tensor, sigma: float | Tensor) -> Tensor:
     """log N(x; mean, sigma^2), elementwise; nats."""
-    return -0.5 * ((x - mean) / sigma).square() - math.log(sigma) - 0.5 * math.log(2 * math.pi)
+    log_sigma = sigma.log() if isinstance(sigma, Tensor) else math.log(sigma)
+    return -0.5 * ((x - mean) / sigma).square() - log_sigma - 0.5 * math.log(2 * math.pi)
 
 
 class _LogMixture(torch.autograd.Function):
@@ -35,13 +36,13 @@ class _LogMixture(torch.autograd.Function):
         log_background: Tensor,
         background: Tensor,
         sigma_fg: float,
-        sigma_bg: float,
+        sigma_bg: Tensor,
     ) -> Tensor:
         from_objects = image[:, None] - objects
         from_background = image - background
         by_object = from_objects.square().mul_(-0.5 / sigma_fg**2).add_((log_objects - math.log(sigma_fg))[:, :, None])
         by_background = from_background.square().mul_(-0.5 / sigma_bg**2)
-        by_background += (log_background - math.log(sigma_bg))[:, None]
+        by_background += (log_background - sigma_bg.log())[:, None]
         highest = torch.maximum(by_object.amax(1), by_background)
         shares = by_object.sub_(highest[:, None]).exp_()
         share_background = by_background.sub_(highest).exp_()
@@ -75,6 +76,7 @@ class Likelihood(ABC):
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
         background: Float[Tensor, "N 3 H W"],
+        scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N"]:
         """Log-likelihood of each image in nats.
 
@@ -84,6 +86,7 @@ class Likelihood(ABC):
             objects: their means, RGB in [0, 1].
             log_background: log mask of the background; finite.
             background: its mean.
+            scale_bg: what sigma_bg is multiplied by, where a likelihood has one; None leaves it.
         """
 
 
@@ -100,6 +103,10 @@ class MixtureLikelihood(Likelihood):
     ) -> None:
         self.sigma_fg, self.sigma_bg, self.mixture_over = sigma_fg, sigma_bg, mixture_over
 
+    def _sigma_bg(self, like: Tensor, scale: Tensor | None) -> Tensor:
+        own = like.new_full((), self.sigma_bg)
+        return own if scale is None else own * scale
+
     def __call__(
         self,
         image: Float[Tensor, "N 3 H W"],
@@ -107,12 +114,14 @@ class MixtureLikelihood(Likelihood):
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
         background: Float[Tensor, "N 3 H W"],
+        scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N"]:
+        sigma_bg = self._sigma_bg(image, scale_bg)
         if self.mixture_over == "channel":
-            args = (image, log_objects, objects, log_background, background, self.sigma_fg, self.sigma_bg)
+            args = (image, log_objects, objects, log_background, background, self.sigma_fg, sigma_bg)
             return _LogMixture.apply(*args).flatten(1).sum(1)
         by_object = log_normal(image[:, None], objects, self.sigma_fg).sum(2)
-        by_background = log_normal(image, background, self.sigma_bg).sum(1)
+        by_background = log_normal(image, background, sigma_bg).sum(1)
         # One sum over all components: over the objects alone it has no gradient where all their masks are zero.
         parts = torch.cat([by_object + log_objects, (by_background + log_background)[:, None]], dim=1)
         return torch.logsumexp(parts, dim=1).flatten(1).sum(1)
@@ -135,6 +144,7 @@ class GaussianLikelihood(Likelihood):
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
         background: Float[Tensor, "N 3 H W"],
+        scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N"]:
         blend = (log_objects.exp()[:, :, None] * objects).sum(1) + log_background.exp()[:, None] * background
         return log_normal(image, blend, self.sigma).flatten(1).sum(1)

@@ -73,7 +73,7 @@ class Apex(SceneModel):
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
-    schedule_names = ("temperature", "discovery_presence", "carry", "discover")
+    schedule_names = ("temperature", "discovery_presence", "carry", "discover", "sigma_bg_scale")
 
     def __init__(
         self,
@@ -134,7 +134,9 @@ class Apex(SceneModel):
             video: RGB in [0, 1].
             schedule: `temperature` of the relaxed Bernoulli; `discovery_presence` p0; `carry`, the probability in
                 [0, 1] with which a video's objects are carried into the next frame in training (see `_carried_on`);
-                `discover`, the probability in [0, 1] with which a carried video may discover too (see `_may_discover`).
+                `discover`, the probability in [0, 1] with which a carried video may discover too (see `_may_discover`);
+                `sigma_bg_scale`, what the mixture's sigma_bg is multiplied by (above 1 the background first learns what
+                it can, such as cast shadows, before objects are asked to explain the rest).
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
@@ -142,7 +144,7 @@ class Apex(SceneModel):
         look_at, follow_in = self.glimpses.sources(video, features)
         proposals = self.discovery(features, look_at, self.glimpses, self.appearance, self.training)
         steps = self._roll_out(look_at, follow_in, proposals, schedule)
-        return self._explain(video, proposals, steps)
+        return self._explain(video, proposals, steps, schedule)
 
     def _alpha(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch g g"]:
         raw = self.mask_decoder(what.reshape(-1, what.shape[-1]))
@@ -251,7 +253,7 @@ class Apex(SceneModel):
             nothing,
         )
 
-    def _explain(self, video: Tensor, proposals: Proposals, steps: Step) -> Scene:
+    def _explain(self, video: Tensor, proposals: Proposals, steps: Step, schedule: Schedule) -> Scene:
         """Rendering, likelihood, KL and the result, for all frames at once."""
         b, t = video.shape[:2]
         paster = self._paster(steps.place, steps.alpha.shape[-1])
@@ -271,6 +273,7 @@ class Apex(SceneModel):
             means.flatten(0, 1),
             masks.log_background.flatten(0, 1),
             backdrop,
+            schedule["sigma_bg_scale"],
         )
         slots = self.max_objects
         terms = {
