@@ -24,7 +24,7 @@ from apex_lab.models.apex import (
 from apex_lab.models.apex.objective import DiscoveryPrior
 from apex_lab.models.apex.objects import Proposals
 from apex_lab.models.apex.rollout import Step
-from apex_lab.scene import Scene, schedule_at
+from apex_lab.scene import Scene, Schedule, schedule_at
 
 SIZE = 32
 SCHEDULE = schedule_at(
@@ -175,10 +175,10 @@ class Inside:
         steps: list[Step] = []
         backdrops: list[torch.Tensor] = []
 
-        def spy(video: torch.Tensor, found: Proposals, left: Step) -> Scene:
+        def spy(video: torch.Tensor, found: Proposals, left: Step, values: Schedule) -> Scene:
             proposals.append(found)
             steps.append(left)
-            return explain(video, found, left)
+            return explain(video, found, left, values)
 
         def listen(z: torch.Tensor) -> torch.Tensor:
             backdrops.append(z)
