@@ -12,7 +12,7 @@ from apex_lab.models.apex import Apex, ApexNormalisation, MixtureLikelihood
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.scene import schedule_at
 from tests.models.apex import naive
-from tests.models.apex.small import SIZE, Inside, lively, video
+from tests.models.apex.small import SCHEDULE, SIZE, Inside, lively, video
 
 P0 = 0.1
 OPEN = schedule_at({"temperature": 0.7, "discovery_presence": P0, "carry": 1.0, "discover": 1.0, "sigma_bg_scale": 1.0})
