@@ -7,6 +7,7 @@ python -m apex_lab.tables scale=cpu tables=[1,3]
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,6 +86,13 @@ class Tables:
 
 def main() -> None:
     """Entry point: `python -m apex_lab.tables`."""
+    try:
+        # before anything is composed: a group of a run may need others that tables do not have
+        _refuse_foreign({}, [word for word in sys.argv[1:] if not word.startswith("-")])
+    except UserError as error:
+        console.setup()
+        console.error(str(error))
+        sys.exit(cli.CONFIG_ERROR)
     cli.launch("tables", check_tables, make_tables, lambda job: f"tables of {job.data}, {job.scale}")
 
 
