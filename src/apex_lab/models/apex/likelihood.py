@@ -38,6 +38,7 @@ class _LogMixture(torch.autograd.Function):
         sigma_fg: float,
         sigma_bg: Tensor,
     ) -> Tensor:
+        """Shapes as in `Likelihood.__call__`, sigma_bg 0-dim -> log density (N, 3, H, W) in nats."""
         from_objects = image[:, None] - objects
         from_background = image - background
         by_object = from_objects.square().mul_(-0.5 / sigma_fg**2).add_((log_objects - math.log(sigma_fg))[:, :, None])
