@@ -35,6 +35,9 @@ from apex_lab.validation import did_you_mean, one_line, sentence
 Check = Callable[[dict[str, Any], dict[str, str], Sequence[str]], Any]
 """(plain configuration, group -> word, overrides) -> a checked job; raises UserError."""
 
+CHOICES = ("model", "ablation", "data", "scale", "experiment")
+"""Groups that say what is run; a run has one choice of each."""
+
 CONFIG_ERROR = 2
 RUN_ERROR = 1
 
@@ -111,6 +114,7 @@ def _preflight(config_name: str, check: Check) -> None:
     try:
         with initialize_config_dir(version_base="1.3", config_dir=arguments.config_path or str(conf_dir())):
             _check_hydra_keys(name, extra, arguments.overrides)
+            _check_groups(config_name, arguments.overrides)
             sweep = arguments.multirun or "hydra.mode=MULTIRUN" in arguments.overrides
             for overrides in _expand(arguments.overrides) if sweep else [arguments.overrides]:
                 _check_composed(name, extra, overrides, check)
@@ -161,6 +165,27 @@ def _check_hydra_keys(name: str, extra: Sequence[str], overrides: Sequence[str])
             raise UserError(sentence(f"Unknown key {word.lstrip('+')}{did_you_mean(last, map(str, siblings))}"))
 
 
+def _check_groups(command: str, overrides: Sequence[str]) -> None:
+    """Refuses choices that a command does not have, and two of one thing in one run: Hydra would merge them into a run
+    that no word names.
+    """
+    if command not in ("train", "bench", "evaluate"):
+        return
+    given: dict[str, str] = {}
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key = override.key_or_group
+        if key not in CHOICES or override.is_delete():
+            continue
+        word = override.get_value_element_as_str()
+        if command == "evaluate":
+            raise UserError(f"{key}={word} is for training: a checkpoint brings its own configuration; leave it out.")
+        if isinstance(override.value(), list):
+            raise UserError(f"{key}={word} puts several into one run: write {key}={word.strip('[]')} -m to run each.")
+        if key in given:
+            raise UserError(f"{key} is given twice: choose one, or write {key}={given[key]},{word} -m to run each.")
+        given[key] = word
+
+
 def _expand(overrides: Sequence[str]) -> list[list[str]]:
     """The jobs of a sweep, as Hydra's own sweeper makes them."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
@@ -200,10 +225,14 @@ def _told(error: Exception, overrides: Sequence[str]) -> str:
     several = re.match(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
     if several:
         key, values = several.groups()
+        if key in CHOICES:
+            return f"{key}={values} holds several values: add -m to run them all."
         return f"{key}={values} holds several values: add -m to run them all, or write {key}=[{values}] for a list."
     if isinstance(error, OverrideParseException):
         return sentence(f"'{error.override}' cannot be read as key=value: {text.splitlines()[0]}")
     unlisted = re.match(r"Could not override '([^']+)'\.\s+No match in the defaults list", text)
+    if unlisted and "ablation" in given:
+        return f"{given['ablation']} changes a part of APEX that this command does not choose: it goes with a run of model=apex."
     if unlisted:
         word = given.get(unlisted.group(1), unlisted.group(1))
         return f"{word} has no default to replace: write +{word}."

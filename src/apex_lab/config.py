@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -255,17 +256,38 @@ def _check_objective(config: Config) -> None:
     components.build(config.data, "data")
     for name, node in config.callbacks.items():
         components.build(node, f"callbacks.{name}")
+    _check_image_size(config)
     values = {f"schedule.{name}": value for name, value in schedules.items()}
     values |= {f"loss.{name}": value for name, value in weights.items()}
     values["lr_scale"] = build_lr_scale(config)
     for key, value in values.items():
         if not callable(value):
             raise UserError(f"{key} is not a schedule: choose one of apex_lab.schedules.")
+    ranges = {f"schedule.{name}": limits for name, limits in getattr(model, "schedule_ranges", {}).items()}
+    for key, value in values.items():
+        _check_range(key, value, ranges.get(key, (0.0, math.inf)), config.trainer.max_steps)
     _same_names("schedule", schedules, getattr(model, "schedule_names", ()))
     _same_names("loss", weights, getattr(model, "term_names", ()))
     if model.needs_training:
         build_optimizer(config, [torch.nn.Parameter(torch.zeros(1))])
         _check_monitor(config.trainer, model)
+
+
+def _check_image_size(config: Config) -> None:
+    """Models that are built for one image size must get the data's."""
+    built, made = config.model.get("image_size"), config.data.get("image_size")
+    if built is not None and made is not None and built != made:
+        raise UserError(f"model.image_size = {built}, but data.image_size = {made}: set data.image_size alone.")
+
+
+def _check_range(key: str, schedule: Callable[[int], float], limits: tuple[float, float], last: int) -> None:
+    """A schedule must stay within its limits at every step that a run makes; looked at in at most some 1,000 steps."""
+    low, high = limits
+    for step in [*range(0, last, max(1, last // 1000)), last]:
+        value = schedule(step)
+        if not low <= value <= high:
+            reach = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
+            raise UserError(f"{key} is {value:g} at step {step}: it must be {reach}.")
 
 
 def _check_monitor(trainer: TrainerPart, model: SceneModel) -> None:

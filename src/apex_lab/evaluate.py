@@ -79,6 +79,9 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
         UserError: unknown key, impossible value, or something that cannot be evaluated; one sentence.
     """
     raw = {key: value for key, value in raw.items() if key != "hydra"}
+    if isinstance(raw.get("evaluation"), Mapping):
+        words = " ".join(f"{key}={value}" for key, value in raw["evaluation"].items())
+        raise UserError(f"evaluation.* are keys of training: here write {words}.")
     asked = validate(EvaluateConfig, raw, "")
     assert isinstance(asked, EvaluateConfig)
     config.refuse_missing(raw)

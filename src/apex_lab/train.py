@@ -29,7 +29,7 @@ from apex_lab.files import read_json
 from apex_lab.interrupts import Deferred, Interrupted, deferring
 from apex_lab.learner import Learner, Stretches
 from apex_lab.loggers import Curves, Wandb
-from apex_lab.runs import Run, group_name
+from apex_lab.runs import Run, fingerprint, group_name
 from apex_lab.scene import SceneModel, schedule_at
 from apex_lab.validation import one_line
 
@@ -90,6 +90,7 @@ def _train(run: Run, device: torch.device) -> None:
     if checkpoint is None:
         model.initialise(torch.as_tensor(data.train_median()))
     else:
+        _compare_configuration(run, checkpoint)
         _load_weights(run, model, checkpoint["weights"])
         console.say(f"going on from step {checkpoint['step']}")
     loggers: list[Logger] = []
@@ -219,6 +220,16 @@ def _checkpoint(run: Run) -> dict[str, Any] | None:
             f"No whole checkpoint is left in {run.last.parent}: remove {run.folder} to start this run anew."
         )
     return None
+
+
+def _compare_configuration(run: Run, checkpoint: dict[str, Any]) -> None:
+    """Refuses to go on from the weights of another configuration, which may have the very same shapes."""
+    if fingerprint(checkpoint["config"]) != fingerprint(run.job.raw):
+        other = " ".join(f"{key}={word}" for key, word in checkpoint["choices"].items() if key in cli.CHOICES)
+        raise UserError(
+            f"The checkpoint in {run.folder} was made with another configuration ({other or 'no choices stored'}): "
+            "put the run's own checkpoint back, or remove the folder to start anew."
+        )
 
 
 def _load_weights(run: Run, model: SceneModel, weights: dict[str, torch.Tensor]) -> None:

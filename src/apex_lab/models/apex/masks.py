@@ -143,7 +143,7 @@ class ApexNormalisation(MaskNormalisation):
         paster: Paster,
     ) -> Masks:
         """Softmax over the foreground (Eq. 10), times m_fg (Eq. 11); the background is the rest (Eq. 12)."""
-        s = self._occupancy(alpha, presence, paster)
+        s = self._occupancy(alpha, torch.where(valid, presence, torch.zeros_like(presence)), paster)
         logit = self._competition(alpha, presence, valid, paster)
         # Where nothing is valid the softmax has no finite entry; any finite stand-in will do, since m_fg is zero there.
         nothing = ~valid.any(-1)[..., None, None]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Float
@@ -74,6 +74,13 @@ class Apex(SceneModel):
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
     schedule_names = ("temperature", "discovery_presence", "carry", "discover", "sigma_bg_scale")
+    schedule_ranges: ClassVar = {
+        "temperature": (0.01, 100.0),
+        "discovery_presence": (0.0, 1.0),
+        "carry": (0.0, 1.0),
+        "discover": (0.0, 1.0),
+        "sigma_bg_scale": (0.01, 100.0),
+    }
 
     def __init__(
         self,

@@ -264,9 +264,13 @@ class Discovery(nn.Module):
 def scope_in_windows(
     scope: Float[Tensor, "B H W"], rows: Float[Tensor, "B D H"], columns: Float[Tensor, "B D W"]
 ) -> Float[Tensor, "B D"]:
-    """Share of each cell's window that the propagated objects leave unexplained, in [0, 1] (discovery's prior)."""
+    """Share of each cell's window that the propagated objects leave unexplained, in [0, 1] (discovery's prior).
+
+    A window too small to hold a pixel centre is fully open, as it is to p_context.
+    """
     inside = torch.einsum("bdh,bhw,bdw->bd", rows, scope, columns)
-    return inside / (rows.sum(-1) * columns.sum(-1)).clamp_min(1e-6)
+    whole = rows.sum(-1) * columns.sum(-1)
+    return torch.where(whole > 0, inside / whole.clamp_min(1e-6), torch.ones_like(whole))
 
 
 def context_probability(scope: Float[Tensor, "B H W"], claims: Float[Tensor, "B D H W"]) -> Float[Tensor, "B D"]:
