@@ -58,6 +58,10 @@ REFUSED = {
     "logger=wand": "logger=wand: there is no such choice in csv, wandb; did you mean 'wandb'?",
     "scale=cpuu": "did you mean 'cpu'?",
     "+ablation=no_entropi": "did you mean 'no_entropy'?",
+    "+ablation=[no_entropy,gaussian]": "puts several into one run: write +ablation=no_entropy,gaussian -m to run each.",
+    "+ablation=no_entropy,gaussian": "ablation=no_entropy,gaussian holds several values: add -m to run them all.",
+    "+ablation=gaussian": "ablation=gaussian swaps APEX's likelihood, and no APEX is chosen here: add model=apex.",
+    "loss.error=-1": "loss.error is -1 at step 0: it must be at least 0.",
     "words": "'words' cannot be read as key=value",
     "x=[1": "'x=[1' cannot be read as key=value",
 }
@@ -79,6 +83,44 @@ def test_refuses_before_anything_starts(word: str, train: Callable[..., Ended], 
 def test_every_job_of_a_sweep_is_checked_before_the_first_starts(train: Callable[..., Ended], tmp_path: Path) -> None:
     refused(train("seed=0,1,-2,3", "-m"), "seed = -2 is wrong", tmp_path)
     refused(train("model.components=2,3,1", "seed=range(2)", "-m"), "components = 1 leaves no room", tmp_path)
+
+
+def test_two_ablations_of_one_run(train: Callable[..., Ended], tmp_path: Path) -> None:
+    told = "ablation is given twice: choose one, or write +ablation=no_entropy,image_stn -m to run each."
+    refused(train("+ablation=no_entropy", "+ablation=image_stn"), told, tmp_path)
+
+
+APEX = ("model=apex", "data=p2d", "scale=smoke")
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("model.image_size=64", "model.image_size = 64, but data.image_size = 32: set data.image_size alone."),
+        ("schedule.temperature.end=0", "schedule.temperature is 0 at step"),
+        ("++schedule.carry.end=2", "schedule.carry is 2 at step 0: it must be between 0 and 1."),
+        ("loss.nll=-1", "loss.nll is -1 at step 0: it must be at least 0."),
+    ],
+)
+def test_values_that_apex_cannot_be_trained_with(
+    word: str, told: str, command: Callable[..., Ended], tmp_path: Path
+) -> None:
+    steps = ("schedule.temperature.steps=2",) if "temperature" in word else ()
+    refused(command("train", *APEX, word, *steps), told, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("+ablation=no_entropy",), "ablation=no_entropy is for training: a checkpoint brings its own configuration"),
+        (("+scale=cpu",), "scale=cpu is for training"),
+        (("++evaluation.videos=4",), "evaluation.* are keys of training: here write videos=4."),
+    ],
+)
+def test_what_belongs_to_training_is_told_so_by_evaluate(
+    words: tuple[str, ...], told: str, command: Callable[..., Ended], tmp_path: Path
+) -> None:
+    refused(command("evaluate", "checkpoint=x.ckpt", *words), told, tmp_path)
 
 
 def test_hydra_s_own_keys_can_be_set(train: Callable[..., Ended], tmp_path: Path) -> None:

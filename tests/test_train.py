@@ -316,6 +316,33 @@ def test_weights_of_other_code_are_refused_on_going_on(
     assert len(ended.err.splitlines()) == 1
 
 
+def test_a_checkpoint_of_another_configuration_is_refused(
+    train: Callable[..., Ended], the_run: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TINY_BROKEN_AT", "5")
+    assert train().code == 1
+    base = the_run()
+    assert train("loss.spread=0.7").code == 1
+    [other] = (path for path in (tmp_path / "outputs").glob("*/seed_0") if path != base)
+    shutil.copy(base / "checkpoints" / "last.ckpt", other / "checkpoints" / "last.ckpt")
+    ended = train("loss.spread=0.7")
+    assert ended.code == 1
+    assert "was made with another configuration (scale=smoke model=tiny data=squares)" in ended.err
+    assert len(ended.err.splitlines()) == 1
+
+
+def test_a_run_that_lost_its_curves_is_evaluated_without_their_page(
+    train: Callable[..., Ended], the_run: Callable[..., Path]
+) -> None:
+    assert train().code == 0
+    for name in ("curves.csv", "metrics.json"):
+        (the_run() / name).unlink()
+    ended = train("evaluation.pictures=1")
+    assert ended.code == 0, ended.err
+    assert (the_run() / "metrics.json").is_file()
+    assert not list(the_run().rglob("curves.png"))
+
+
 def test_a_full_disk_is_told_and_the_checkpoint_before_stays(
     train: Callable[..., Ended], the_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:

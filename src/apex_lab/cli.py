@@ -174,15 +174,18 @@ def _check_groups(command: str, overrides: Sequence[str]) -> None:
     given: dict[str, str] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.key_or_group
-        if key not in CHOICES or override.is_delete():
+        if key not in CHOICES or override.is_delete() or override.is_sweep_override():
             continue
         word = override.get_value_element_as_str()
         if command == "evaluate":
             raise UserError(f"{key}={word} is for training: a checkpoint brings its own configuration; leave it out.")
+        plus = "+" if override.is_add() else ""
         if isinstance(override.value(), list):
-            raise UserError(f"{key}={word} puts several into one run: write {key}={word.strip('[]')} -m to run each.")
-        if key in given:
-            raise UserError(f"{key} is given twice: choose one, or write {key}={given[key]},{word} -m to run each.")
+            raise UserError(
+                f"{key}={word} puts several into one run: write {plus}{key}={word.strip('[]')} -m to run each."
+            )
+        if key in given and override.is_add():
+            raise UserError(f"{key} is given twice: choose one, or write +{key}={given[key]},{word} -m to run each.")
         given[key] = word
 
 
@@ -225,17 +228,17 @@ def _told(error: Exception, overrides: Sequence[str]) -> str:
     several = re.match(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
     if several:
         key, values = several.groups()
-        if key in CHOICES:
+        if key.lstrip("+") in CHOICES:
             return f"{key}={values} holds several values: add -m to run them all."
         return f"{key}={values} holds several values: add -m to run them all, or write {key}=[{values}] for a list."
     if isinstance(error, OverrideParseException):
         return sentence(f"'{error.override}' cannot be read as key=value: {text.splitlines()[0]}")
-    unlisted = re.match(r"Could not override '([^']+)'\.\s+No match in the defaults list", text)
-    if unlisted and "ablation" in given:
-        return f"{given['ablation']} changes a part of APEX that this command does not choose: it goes with a run of model=apex."
+    unlisted = re.match(r"(?:In '([^']+)': )?Could not override '([^']+)'\.\s+No match in the defaults list", text)
     if unlisted:
-        word = given.get(unlisted.group(1), unlisted.group(1))
-        return f"{word} has no default to replace: write +{word}."
+        inside, group = unlisted.groups()
+        if inside:
+            return f"{inside.replace('/', '=')} swaps APEX's {group}, and no APEX is chosen here: add model=apex."
+        return f"{given.get(group, group)} has no default to replace: write +{given.get(group, group)}."
     there = re.match(r"Could not append to config\. An item is already at '([^']+)'", text)
     if there:
         return f"{there.group(1)} is there already: write {given.get(there.group(1), there.group(1))} without the +."

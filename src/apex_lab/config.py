@@ -263,9 +263,12 @@ def _check_objective(config: Config) -> None:
     for key, value in values.items():
         if not callable(value):
             raise UserError(f"{key} is not a schedule: choose one of apex_lab.schedules.")
-    ranges = {f"schedule.{name}": limits for name, limits in getattr(model, "schedule_ranges", {}).items()}
+    ranges = dict.fromkeys(values, (0.0, math.inf)) | dict.fromkeys(
+        (f"schedule.{name}" for name in schedules), (-math.inf, math.inf)
+    )
+    ranges |= {f"schedule.{name}": limits for name, limits in getattr(model, "schedule_ranges", {}).items()}
     for key, value in values.items():
-        _check_range(key, value, ranges.get(key, (0.0, math.inf)), config.trainer.max_steps)
+        _check_range(key, value, ranges[key], config.trainer.max_steps)
     _same_names("schedule", schedules, getattr(model, "schedule_names", ()))
     _same_names("loss", weights, getattr(model, "term_names", ()))
     if model.needs_training:

@@ -14,7 +14,17 @@ from apex_lab.scene import ABSENT, Scene
 from apex_lab.view import Item, component_panels
 from apex_lab.view.canvas import GAP, MARGIN, PAPER
 from apex_lab.view.colors import color_of
-from apex_lab.view.components import _BACKGROUND_TONE, _CAPTION, _GROUP_GAP, _HEADING, _LABELS, _PLOT, lives
+from apex_lab.view.components import (
+    _BACKGROUND_TONE,
+    _CAPTION,
+    _GROUP_GAP,
+    _HEADING,
+    _LABELS,
+    _PLOT,
+    _SCALE,
+    _TIME,
+    lives,
+)
 from tests.view.scenes import BACKGROUND, BLUE, FIRST, GREY, RED, SECOND, H, T, W, item, scene, squares
 
 SCALE = 4  # 24 pixels to at least 96
@@ -23,7 +33,7 @@ SCALE = 4  # 24 pixels to at least 96
 def panel(page: np.ndarray, row: int, stage: int, column: int, columns: int = 3) -> np.ndarray:
     """(H, W, 3): the first pixel right and below the middle of every magnified pixel of a panel."""
     group = columns * (SCALE * W + GAP) + _GROUP_GAP
-    top = MARGIN + _CAPTION + _HEADING + row * (SCALE * H + 2 * GAP) + SCALE // 2
+    top = MARGIN + _CAPTION + _HEADING + row * (_TIME + SCALE * H + 2 * GAP) + _TIME + SCALE // 2
     left = MARGIN + _LABELS + stage * group + column * (SCALE * W + GAP) + SCALE // 2
     return page[top : top + SCALE * H : SCALE, left : left + SCALE * W : SCALE]
 
@@ -56,27 +66,26 @@ def test_an_identity_may_change_its_component() -> None:
 def test_rows_show_mask_appearance_and_window(tmp_path: Path) -> None:
     page = draw(tmp_path / "panels.png")
     assert page.shape == (
-        2 * MARGIN + _CAPTION + _HEADING + 3 * (SCALE * H + 2 * GAP),
+        2 * MARGIN + _CAPTION + _HEADING + 3 * (_TIME + SCALE * H + 2 * GAP),
         2 * MARGIN + _LABELS + 3 * (3 * (SCALE * W + GAP) + _GROUP_GAP) + _PLOT,
         3,
     )
     masks = squares()[2][0]
-    below_label = slice(8, None)  # the frame's number is written in the upper corner of the mask
     for row, (k, tone, color) in enumerate(
         ((2, _BACKGROUND_TONE, GREY), (0, color_of(FIRST), RED), (1, color_of(SECOND), BLUE))
     ):
         times = (0, 2, 3) if k != 1 else (1, 2, 3)
         for stage, t in enumerate(times):
             shown, mask = panel(page, row, stage, 0), masks[t, k].numpy() > 0
-            assert (shown[below_label][mask[below_label]] == tone).all()
-            assert (shown[below_label][~mask[below_label]] == 0).all()
+            assert (shown[mask] == tone).all()
+            assert (shown[~mask] == 0).all()
             assert (panel(page, row, stage, 1) == color).all()
 
 
 def test_windows_are_drawn_where_they_are(tmp_path: Path) -> None:
     page = draw(tmp_path / "panels.png")
     group = 3 * (SCALE * W + GAP) + _GROUP_GAP
-    top = MARGIN + _CAPTION + _HEADING + 1 * (SCALE * H + 2 * GAP)
+    top = MARGIN + _CAPTION + _HEADING + 1 * (_TIME + SCALE * H + 2 * GAP) + _TIME
     left = MARGIN + _LABELS + 2 * group + 2 * (SCALE * W + GAP)  # last frame, t = 3: rows 2 to 8, columns 5 to 11
     view = page[top : top + SCALE * H, left : left + SCALE * W]
     is_line = (view == color_of(FIRST)).all(axis=-1)
@@ -93,9 +102,9 @@ def test_windows_are_drawn_where_they_are(tmp_path: Path) -> None:
 def test_presence_is_a_bar_per_frame(tmp_path: Path) -> None:
     page = draw(tmp_path / "panels.png")
     left = MARGIN + _LABELS + 3 * (3 * (SCALE * W + GAP) + _GROUP_GAP)
-    top = MARGIN + _CAPTION + _HEADING + 2 * (SCALE * H + 2 * GAP)
+    top = MARGIN + _CAPTION + _HEADING + 2 * (_TIME + SCALE * H + 2 * GAP) + _TIME
     middle = page[top + SCALE * H // 2, left : left + _PLOT]
-    centres = [int(30 + (t + 0.5) * (_PLOT - 34) / T) for t in range(T)]
+    centres = [int(30 + (t + 0.5) * (_PLOT - 30 - _SCALE) / T) for t in range(T)]
     assert [tuple(middle[x].tolist()) for x in centres] == [PAPER, *3 * [color_of(SECOND)]]
 
 
@@ -130,7 +139,7 @@ def test_odd_scenes_are_drawn(tmp_path: Path, kind: str, rows: int) -> None:
     name, video, said, b, truth = item()
     component_panels(tmp_path / "panels.png", Item(name, video, odd(said, kind), b, truth))
     page = np.asarray(Image.open(tmp_path / "panels.png"))
-    assert len(page) == 2 * MARGIN + _CAPTION + _HEADING + rows * (SCALE * H + 2 * GAP)
+    assert len(page) == 2 * MARGIN + _CAPTION + _HEADING + rows * (_TIME + SCALE * H + 2 * GAP)
     assert (page[:, -MARGIN:] == PAPER).all()
 
 

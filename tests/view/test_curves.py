@@ -53,7 +53,7 @@ def test_a_single_numbered_column_keeps_its_name(tmp_path: Path) -> None:
 def test_page_is_a_picture_with_as_many_rows_as_needed(table: Path, tmp_path: Path) -> None:
     curve_page(tmp_path / "curves.png", table)
     page = Image.open(tmp_path / "curves.png")
-    assert page.size == (1440, 530)
+    assert page.size == (1440, 560)
     dark = (np.asarray(page.convert("L")) < 128).mean()
     assert 0.003 < dark < 0.2
 

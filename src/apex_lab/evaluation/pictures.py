@@ -14,6 +14,7 @@ from apex_lab.evaluation.score import Batches, Predictor
 from apex_lab.files import make_folder
 from apex_lab.metrics import KEYS
 from apex_lab.view import Item, render_all
+from apex_lab.view.curves import has_rows
 from apex_lab.view.item import one_video
 
 PICTURES_BY = "ari_fg"
@@ -57,6 +58,7 @@ def choose(rows: Sequence[Mapping[str, Any]], count: int, key: str = PICTURES_BY
 def draw(
     folder: Path,
     chosen: Sequence[Chosen],
+    key: str,
     positions: Mapping[str, int],
     predictor: Predictor,
     batches: Batches,
@@ -64,15 +66,24 @@ def draw(
 ) -> list[Path]:
     """Asks the model for the chosen videos once more and draws them; the pictures' paths, the film strip first.
 
-    Pictures of an earlier evaluation in the folder are replaced.
+    Pictures of an earlier evaluation in the folder are replaced. A table of curves without a row is left out.
+
+    Args:
+        folder: where to.
+        chosen: the videos; `key` is the score that ranked them, which their captions tell.
+        key: one of `apex_lab.metrics.KEYS`.
+        positions: video name -> place in the data set.
+        predictor: the model.
+        batches: of the data set.
+        curves: the run's table of curves.
     """
     if not chosen:
         return []
     items = []
-    for title, name, _ in chosen:
+    for title, name, value in chosen:
         batch = default_collate([batches.dataset[positions[name]]])
         scene = one_video(predictor(batch), 0)
-        items.append(Item(f"{title} {name}", batch["video"], scene, 0, batch["segmentation"]))
+        items.append(Item(f"{title} {name} ({key} {value:.2f})", batch["video"], scene, 0, batch["segmentation"]))
     for old in make_folder(folder).glob("components_*.png"):
         old.unlink()
-    return render_all(folder, items, curves if curves is not None and curves.is_file() else None)
+    return render_all(folder, items, curves if curves is not None and has_rows(curves) else None)

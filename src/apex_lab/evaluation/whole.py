@@ -64,7 +64,7 @@ def evaluate(
     result = tally.evaluator.result()
     chosen = pictures.choose(result["per_video"], asked.pictures, asked.pictures_by)
     view = asked.view or asked.folder / "view"
-    drawn = pictures.draw(view, chosen, tally.positions, predictor, batches, asked.curves)
+    drawn = pictures.draw(view, chosen, asked.pictures_by, tally.positions, predictor, batches, asked.curves)
     written = []
     if asked.export is not None:
         assert parts is not None

@@ -21,7 +21,9 @@ _BACKGROUND_TONE: Color = (225, 228, 232)
 _LABELS = 130
 _HEADING = 44
 _CAPTION = 30
-_PLOT = 260
+_PLOT = 270
+_SCALE = 56
+_TIME = 15
 _STAGES = ("first frame", "middle", "last frame")
 _COLUMNS = ("mask", "appearance", "window")
 _GROUP_GAP = 16
@@ -87,8 +89,8 @@ def component_panels(path: Path, item: Item, max_components: int = 10) -> None:
 
     A row shows, for the first, middle and last frame in which the identity is there: its soft mask, its own picture
     (`Scene.means`; without them the input under its mask), and its window on the input (left out for models without
-    windows). At the end: presence over time (bars) and the share of pixels under its mask (line, relative to its
-    largest).
+    windows). At the end: presence over time (bars) and the share of pixels under its mask (line, on an axis of
+    its own, at the right).
 
     Args:
         path: PNG to write.
@@ -107,17 +109,18 @@ def component_panels(path: Path, item: Item, max_components: int = 10) -> None:
     group = len(columns) * (width + GAP) + _GROUP_GAP
     page, draw = sheet(
         2 * MARGIN + _LABELS + len(_STAGES) * group + _PLOT,
-        2 * MARGIN + _CAPTION + _HEADING + max(1, len(shown)) * (height + 2 * GAP),
+        2 * MARGIN + _CAPTION + _HEADING + max(1, len(shown)) * (_TIME + height + 2 * GAP),
     )
     rest = f", {len(everyone) - len(shown)} smaller ones not shown" if len(everyone) > len(shown) else ""
     caption = f"{clip.name}: {len(everyone)} component{'s' * (len(everyone) != 1)}{rest}"
     draw.text((MARGIN, MARGIN), fit(caption, page.width - 2 * MARGIN, font(17, bold=True)), INK, font(17, bold=True))
     _headings(draw, width, group, columns, has_means=clip.scene.means is not None)
     for row, life in enumerate(shown):
-        top = MARGIN + _CAPTION + _HEADING + row * (height + 2 * GAP)
+        top = MARGIN + _CAPTION + _HEADING + row * (_TIME + height + 2 * GAP) + _TIME
         _label(draw, life, top + height // 2)
         for stage, t in _stages(life):
             left = MARGIN + _LABELS + stage * group
+            draw.text((left, top - 2), f"t = {t}", FAINT, font(12), anchor="ls")
             for i, panel in enumerate(_panels(clip, life, int(t), (height, width))):
                 page.paste(panel, (left + i * (width + GAP), top))
         page.paste(_plot(life, _PLOT, height), (MARGIN + _LABELS + len(_STAGES) * group, top))
@@ -167,9 +170,6 @@ def _panels(clip: Clip, life: Life, t: int, size: tuple[int, int]) -> list[Image
         picture = scene.means[0, t, k].permute(1, 2, 0).numpy()
     painted = [rgb8(mask * np.array(life.color) / 255), rgb8(picture)]
     cells = [Image.fromarray(enlarge(pixels, size)) for pixels in painted]
-    draw = ImageDraw.Draw(cells[0])
-    draw.rectangle(draw.textbbox((4, 4), f" t = {t} ", font(12)), fill=(0, 0, 0))
-    draw.text((4, 4), f" t = {t} ", (255, 255, 255), font(12))
     if scene.windows is not None:
         view = Image.fromarray(enlarge(clip.frames[t], size))
         cells.append(_window(view, scene.windows[0, t, k].numpy(), color_of(life.identity)))
@@ -197,10 +197,10 @@ def _window(picture: Image.Image, window: Float[np.ndarray, "4"], color: Color) 
 
 
 def _plot(life: Life, width: int, height: int) -> Image.Image:
-    """Presence as bars and share of pixels as a line, over frames."""
+    """Presence as bars (axis at the left) and share of pixels as a line (axis at the right), over frames."""
     fine = 3  # drawn larger and scaled down, which smooths the line
     page, draw = sheet(width * fine, height * fine)
-    left, right, bottom, top = 30 * fine, (width - 4) * fine, (height - 18) * fine, 6 * fine
+    left, right, bottom, top = 30 * fine, (width - _SCALE) * fine, (height - 18) * fine, 6 * fine
     frames = len(life.presence)
     step = (right - left) / frames
     air = min(fine, step / 4)
@@ -223,7 +223,9 @@ def _plot(life: Life, width: int, height: int) -> Image.Image:
     draw = ImageDraw.Draw(page)
     draw.text((26, 6), "1", FAINT, font(11), anchor="rt")
     draw.text((26, height - 18), "0", FAINT, font(11), anchor="rb")
+    for value, y, anchor in ((largest, 6, "lt"), (0.0, height - 18, "lb")):
+        draw.text((width - _SCALE + 4, y), f"{100 * value:.{int(value > 0)}f} %", INK, font(11), anchor=anchor)
     draw.text((30, height - 4), "t = 0", FAINT, font(11), anchor="lb")
     if frames > 1:
-        draw.text((width - 4, height - 4), f"{frames - 1}", FAINT, font(11), anchor="rb")
+        draw.text((width - _SCALE, height - 4), f"{frames - 1}", FAINT, font(11), anchor="rb")
     return page

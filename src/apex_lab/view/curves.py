@@ -46,6 +46,9 @@ _ORDER = (
 )
 """Panels in reading order, by what is found in their names; `_REST` is the loss terms and all not named here."""
 
+_TITLES = {"share": "share of pixels (0: largest object)"}
+"""What panels are called whose names do not say enough."""
+
 _SCORE = re.compile(r"^(video_)?(ari|msc|sc)(_fg)?$")
 """Quantities whose best value is 1; drawn on an axis that ends there."""
 
@@ -56,8 +59,9 @@ def curve_page(path: Path, curves_csv: Path) -> None:
     Columns are named `group/quantity` (train, val, test, diagnostics, schedule, or nothing): the groups of one quantity
     share a panel. Columns that differ by a number at the end (`diagnostics/share_0`, `diagnostics/share_1`, ...) share
     a panel as well, one line each. Empty cells are skipped, so columns may be logged at steps of their own; columns
-    without any number are left out. Quantities that stay positive and mostly span more than two orders of magnitude
-    get a logarithmic axis. Long noisy curves are drawn faintly with their running median on top.
+    without any number are left out. Quantities that stay positive and reach more than 30 times their median get a
+    logarithmic axis; of others, peaks far outside the usual range are cut off, and the title tells how far they reach.
+    Long noisy curves are drawn faintly with their running median on top. The page is headed by the run folder's name.
 
     Args:
         path: PNG to write; equal curves make equal bytes.
@@ -74,9 +78,10 @@ def curve_page(path: Path, curves_csv: Path) -> None:
     # the user's own matplotlib settings must not change the picture
     with matplotlib.style.context("default"):
         figure = Figure(
-            figsize=(3.6 * _COLUMNS, 2.5 * rows + 0.3), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
+            figsize=(3.6 * _COLUMNS, 2.5 * rows + 0.6), dpi=100, layout=ConstrainedLayoutEngine(w_pad=0.08, h_pad=0.08)
         )
         FigureCanvasAgg(figure)
+        figure.suptitle("/".join(curves_csv.absolute().parts[-3:-1]), fontsize=12, fontweight="bold")
         axes = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
         for ax, (name, lines) in zip(axes, panels.items(), strict=False):
             _draw(ax, name, lines)
@@ -85,6 +90,14 @@ def curve_page(path: Path, curves_csv: Path) -> None:
             ax.set_axis_off()
         with picture_file(path) as file:
             figure.savefig(file, format="png", metadata={"Software": None})
+
+
+def has_rows(curves_csv: Path) -> bool:
+    """Whether there is a table with more than its header; a run that lost its table can still be evaluated."""
+    if not curves_csv.is_file():
+        return False
+    with curves_csv.open("rb") as file:
+        return sum(1 for _, line in zip(range(2), file, strict=False) if line.strip()) == 2
 
 
 def _read(curves_csv: Path) -> pd.DataFrame:
@@ -142,18 +155,33 @@ def _draw(ax: Axes, name: str, lines: Sequence[tuple[str, str, pd.Series]]) -> N
             marker = "o" if len(values) <= 30 else None
             ax.plot(values.index, values, color=color, linewidth=1.5, marker=marker, markersize=3, label=label)
     everything = np.concatenate([values.to_numpy(float) for _, _, values in lines])
-    low, high = np.quantile(everything, [0.05, 0.95])
-    if everything.min() > 0 and high > 100 * low:
-        ax.set_yscale("log")
-    else:
-        ax.ticklabel_format(axis="y", useOffset=False)
-    if _SCORE.match(name):
-        ax.set_ylim(min(0.0, everything.min()), 1)
+    cut = _set_range(ax, name, everything)
     ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
-    ax.set_title(name, fontsize=10, fontweight="bold")
+    ax.set_title(_TITLES.get(name, name) + cut, fontsize=10, fontweight="bold")
     ax.tick_params(labelsize=8)
     ax.grid(visible=True, color="#e3e6ea", linewidth=0.6)
     ax.spines[["top", "right"]].set_visible(False)
     ax.set_xlabel(STEP, fontsize=8)
     if len(lines) > 1 or lines[0][0] in ("val", "test"):
         ax.legend(fontsize=7, frameon=False, ncols=1 + len(lines) // 5)
+
+
+def _set_range(ax: Axes, name: str, values: np.ndarray) -> str:
+    """Chooses the axis of a panel's values; what to add to the title where peaks are cut off."""
+    if _SCORE.match(name):
+        ax.set_ylim(min(0.0, values.min()), 1)
+        return ""
+    if values.min() > 0 and values.max() > 30 * np.median(values):
+        ax.set_yscale("log")
+        return ""
+    ax.ticklabel_format(axis="y", useOffset=False)
+    low, high = np.quantile(values, [0.05, 0.95])
+    reach = 2 * (high - low)
+    cut = ""
+    if reach > 0 and values.max() > high + reach:
+        ax.set_ylim(top=high + reach)
+        cut += f", up to {values.max():.3g}"
+    if reach > 0 and values.min() < low - reach:
+        ax.set_ylim(bottom=low - reach)
+        cut += f", down to {values.min():.3g}"
+    return cut

@@ -47,5 +47,5 @@ def render_all(
 
 
 def _slug(name: str) -> str:
-    """A name as part of a file name."""
-    return re.sub(r"[^a-z0-9.]+", "_", name.lower()).strip("_.")[:60] or "video"
+    """A name as part of a file name, without a remark in brackets at its end."""
+    return re.sub(r"[^a-z0-9.]+", "_", re.sub(r" \([^()]*\)$", "", name).lower()).strip("_.")[:60] or "video"

@@ -58,6 +58,17 @@ def test_absent_components_are_exactly_nothing(masks: MaskNormalisation) -> None
     assert (none == 0).all()
 
 
+@pytest.mark.parametrize("masks", [ApexNormalisation(), ApexNormalisation(5.0, "minus_c"), ScalorNormalisation()])
+@pytest.mark.parametrize("present", [0, 2])
+def test_what_absent_components_hold_does_not_matter(masks: MaskNormalisation, present: int) -> None:
+    raw, presence, valid, windows = scene(present)
+    paster = Paster(windows, G, SIZE)
+    rubbish = torch.where(valid, presence, torch.full_like(presence, 0.6))
+    clean, other = (masks.compose(masks.logits(raw), z, valid, paster) for z in (presence, rubbish))
+    for one, two in zip(clean, other, strict=True):
+        assert torch.equal(one, two)
+
+
 @pytest.mark.parametrize("outside", ["zero", "minus_c"])
 def test_apex_against_the_equations(outside: str) -> None:
     raw, presence, valid, windows = scene(K)
@@ -104,6 +115,12 @@ def test_scalor_against_its_formula() -> None:
     want = warped**2 / warped.sum(1, keepdim=True).clamp_min(1e-6)
     torch.testing.assert_close(out.objects, want)
     torch.testing.assert_close(out.background, 1 - want.sum(1).clamp(0, 1))
+    # the scope of what was propagated, where windows overlap and where they do not, and a proposal's claim
+    alone = ScalorNormalisation().foreground(torch.sigmoid(raw), presence, Paster(windows, G, SIZE))
+    torch.testing.assert_close(alone, want.sum(1).clamp(0, 1))
+    assert ((warped > 0).sum(1) > 1).any()
+    claim = ScalorNormalisation().claim(torch.sigmoid(raw), Paster(windows, G, SIZE))
+    torch.testing.assert_close(claim * presence[..., None, None], warped)
 
 
 def test_claim_is_tanh_softplus_inside_the_window_only() -> None:

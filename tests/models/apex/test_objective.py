@@ -126,6 +126,16 @@ def test_scope_in_windows_is_the_mean_scope_inside() -> None:
     torch.testing.assert_close(scope_in_windows(scope, rows, columns), torch.tensor([[0.5, 1.0]]), rtol=0, atol=0.06)
 
 
+def test_a_window_that_holds_no_pixel_centre_is_fully_open() -> None:
+    """To the prior as to p_context: else discovering there would cost what no evidence can pay."""
+    paster = Paster(torch.tensor([[[0.02, 0.02, 0.0, 0.0], [0.4, 0.4, 0.0, 0.0]]]), 8, 8)
+    rows, columns = paster.inside()
+    assert rows[0, 0].sum() == 0
+    scope, claims = torch.zeros(1, 8, 8), ApexNormalisation().claim(torch.ones(1, 2, 8, 8), paster)
+    assert scope_in_windows(scope, rows, columns).tolist() == [[1.0, 0.0]]
+    torch.testing.assert_close(context_probability(scope, claims), torch.tensor([[1.0, 0.0]]), rtol=0, atol=1e-5)
+
+
 def test_windows() -> None:
     windows = Windows(grid=4, reach=1.5, size_step=0.3, centre_step=0.2)
     still = torch.tensor([[-1.0, 0.3, 0.5, -0.9]])

@@ -27,4 +27,6 @@ def test_schedules_at_the_paper_s_scale() -> None:
     temperature, p0 = schedules["temperature"], schedules["discovery_presence"]
     assert [temperature(s) for s in (0, 10_000, 20_000, 40_000)] == pytest.approx([1.0, 0.65, 0.3, 0.3])
     assert [p0(s) for s in (0, 5_000, 10_000, 40_000)] == pytest.approx([0.1, 0.01, 1e-3, 1e-3])
-    assert schedules["carry"](40_000) == 1.0  # full sequences
+    assert [schedules["carry"](s) for s in (0, 500, 40_000)] == [1.0, 1.0, 1.0]  # full sequences
+    assert [schedules["discover"](s) for s in (0, 500, 40_000)] == [1.0, 1.0, 1.0]
+    assert [schedules["sigma_bg_scale"](s) for s in (0, 500, 40_000)] == [1.0, 1.0, 1.0]
