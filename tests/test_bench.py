@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -159,9 +160,12 @@ def test_the_parts_are_all_there_and_add_up() -> None:
     work = workload()
     for training in (True, False):
         work.step(training)()
+        began = time.perf_counter()
         seconds = work.seconds_by_part(training)
+        passed = time.perf_counter() - began
         assert set(seconds) == set(PARTS) - (set() if training else {"backward", "update"})
         assert all(value > 0 for value in seconds.values())
+        assert 0.8 * passed < sum(seconds.values()) <= passed  # the rest is setting up the watch
     own = [vars(owner) for owner in (work.model, work.model.encoder, work.model.masks)]
     assert not any(name in names for names in own for name in ("_roll_out", "_explain", "forward", "claim"))
 

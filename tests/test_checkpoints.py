@@ -80,6 +80,14 @@ def test_other_people_s_checkpoints_are_refused(tmp_path: Path) -> None:
         checkpoints.load(path)
 
 
+def test_weights_of_a_diverged_run_are_refused(tmp_path: Path) -> None:
+    sick = content()
+    sick["weights"]["layer.weight"][3, 4] = float("nan")
+    checkpoints.save(tmp_path / "last.ckpt", sick)
+    with pytest.raises(UserError, match="weights that are not finite"):
+        checkpoints.load(tmp_path / "last.ckpt")
+
+
 def test_code_in_a_checkpoint_is_not_run(tmp_path: Path) -> None:
     class Evil:
         def __reduce__(self) -> tuple[Any, ...]:

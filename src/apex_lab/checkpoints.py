@@ -81,4 +81,7 @@ def load(path: Path) -> dict[str, Any]:
             f"{path} has format {content['format']}, this version of apex_lab reads {FORMAT}: "
             "use the version that wrote it."
         )
+    sick = [name for name, weight in content["weights"].items() if not torch.isfinite(weight).all()]
+    if sick:
+        raise UserError(f"{path} holds weights that are not finite ({sick[0]}): its run diverged; use an earlier one.")
     return content

@@ -27,8 +27,8 @@ class BackgroundSubtraction(SceneModel):
     4. Regions of consecutive frames are linked (`apex_lab.models.linking.link`).
 
     The reconstruction is the median picture with every object in its mean colour. The median picture is a buffer, so
-    checkpoints carry it. Defaults were chosen by the four segmentation scores of 32 training videos of P2D, which is
-    more help from labels than any learned model gets.
+    checkpoints carry it. Defaults were chosen by the four segmentation scores of 32 training videos of P2D: labels
+    chose them.
 
     Args:
         image_size: side of the (square) images, in pixels.

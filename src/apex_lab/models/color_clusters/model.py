@@ -48,7 +48,7 @@ class ColorClusters(SceneModel):
     5. Regions of consecutive frames are linked (`apex_lab.models.linking.link`).
 
     A video's result depends on the video alone, and is the same at every call. Defaults were chosen by the four
-    segmentation scores of 32 training videos of P2D, which is more help from labels than any learned model gets.
+    segmentation scores of 32 training videos of P2D: labels chose them.
 
     Args:
         colors: number of clusters, k.
