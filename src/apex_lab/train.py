@@ -77,6 +77,8 @@ def _reason(error: BaseException) -> str:
 def _train(run: Run, device: torch.device) -> None:
     config = run.job.config
     checkpoint = _checkpoint(run)
+    if checkpoint is not None:
+        _compare_configuration(run, checkpoint)
     console.say(f"{title(run.job)} on {device.type}: {run.folder}")
     model = build_model(config)
     if model.needs_training and checkpoint is None and device.type == "cpu":
@@ -90,7 +92,6 @@ def _train(run: Run, device: torch.device) -> None:
     if checkpoint is None:
         model.initialise(torch.as_tensor(data.train_median()))
     else:
-        _compare_configuration(run, checkpoint)
         _load_weights(run, model, checkpoint["weights"])
         console.say(f"going on from step {checkpoint['step']}")
     loggers: list[Logger] = []

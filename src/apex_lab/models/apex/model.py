@@ -81,6 +81,7 @@ class Apex(SceneModel):
         "discover": (0.0, 1.0),
         "sigma_bg_scale": (0.01, 100.0),
     }
+    """Smallest and largest value that each schedule may take in a run."""
 
     def __init__(
         self,
