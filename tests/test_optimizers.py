@@ -25,6 +25,14 @@ def test_orthogonalised_keeps_singular_vectors_and_maps_singular_values_by_the_q
         assert mapped.max() < 1.3
 
 
+def test_orthogonalised_is_exact_enough_in_float32_where_gradients_are_nearly_of_low_rank() -> None:
+    generator = torch.Generator().manual_seed(3)
+    u, _ = torch.linalg.qr(torch.randn(64, 64, dtype=torch.float64, generator=generator))
+    v, _ = torch.linalg.qr(torch.randn(288, 64, dtype=torch.float64, generator=generator))
+    x = u @ torch.logspace(0, -8, 64, dtype=torch.float64).diag() @ v.T
+    torch.testing.assert_close(orthogonalised(x.float()).double(), orthogonalised(x), rtol=0.0, atol=1e-2)
+
+
 def test_orthogonalised_does_not_depend_on_the_scale_and_leaves_zeros() -> None:
     x = torch.randn(4, 7, generator=torch.Generator().manual_seed(1))
     torch.testing.assert_close(orthogonalised(1e6 * x), orthogonalised(1e-6 * x))

@@ -25,15 +25,19 @@ QUINTIC = (3.4445, -4.7750, 2.0315)
 def orthogonalised(matrix: Float[Tensor, "rows columns"], iterations: int = 5) -> Float[Tensor, "rows columns"]:
     """The matrix with its singular values brought near 1 (between about 0.7 and 1.2) and its singular vectors kept.
 
-    Newton-Schulz iteration on X X^T X, from singular values of at most 1. A matrix of zeros stays zero.
+    Newton-Schulz iteration x <- (a + b x x^T + c (x x^T)^2) x, from singular values of at most 1, carried out on the
+    small square x x^T and applied to the matrix once. A matrix of zeros stays zero.
     """
     a, b, c = QUINTIC
     wide = matrix.shape[0] <= matrix.shape[1]
     x = matrix if wide else matrix.T
     x = x / x.norm().clamp_min(torch.finfo(x.dtype).tiny)
+    gram, applied = x @ x.T, torch.eye(len(x), dtype=x.dtype, device=x.device)
     for _ in range(iterations):
-        gram = x @ x.T
-        x = a * x + (b * gram + c * gram @ gram) @ x
+        step = torch.addmm(gram, gram, gram, beta=b, alpha=c)
+        step.diagonal().add_(a)
+        applied, gram = step @ applied, step @ gram @ step
+    x = applied @ x
     return x if wide else x.T
 
 
