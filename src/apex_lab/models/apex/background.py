@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
@@ -13,6 +15,9 @@ from apex_lab.nn.blocks import BroadcastDecoder, conv_norm, mlp
 from apex_lab.nn.distributions import Gaussian, gaussian_from, standard_normal
 
 Count = Annotated[int, Field(gt=0)]
+
+BRIGHTEST = math.log(2)
+"""Largest shade, in logits: a grey of 0.5 becomes 0.67 at most."""
 
 
 class Background(nn.Module):
@@ -26,6 +31,12 @@ class Background(nn.Module):
             logits: a parameter, initialised at the training set's per-pixel median, as one initialises an output bias
             at the mean of the data. A convolutional decoder needs thousands of steps to draw sharp static edges, and
             until then the foreground explains them.
+        change: what z_bg may do to the picture. `colour` is the paper's: anything. `shade` lets it darken or (less)
+            brighten the bias image, all channels of a pixel alike in their logits, which needs a `learned` one: that
+            draws cast shadows, and not the grey parts of a moving arm, which the foreground would then never explain.
+
+    Raises:
+        ValueError: there is no bias image to shade.
     """
 
     def __init__(
@@ -34,8 +45,12 @@ class Background(nn.Module):
         latent: Count = 32,
         width: Count = 32,
         bias_image: Literal["none", "learned"] = "learned",
+        change: Literal["colour", "shade"] = "colour",
     ) -> None:
         super().__init__()
+        if change == "shade" and bias_image == "none":
+            raise ValueError("change = 'shade' needs a bias image to shade: set bias_image = 'learned'")
+        self.change = change
         layers: list[nn.Module] = [conv_norm(4, width, kernel=5, stride=4)]
         side = image_size // 4
         while side > 4:
@@ -43,7 +58,7 @@ class Background(nn.Module):
             side = (side + 1) // 2
         self.encoder = nn.Sequential(*layers, nn.Flatten(), mlp([width * side * side, 4 * latent, 2 * latent]))
         self.transition = mlp([latent, 4 * latent, 2 * latent])
-        self.decoder = BroadcastDecoder(latent, image_size, width, 3)
+        self.decoder = BroadcastDecoder(latent, image_size, width, 3 if change == "colour" else 1)
         self.bias_image = nn.Parameter(torch.zeros(3, image_size, image_size)) if bias_image == "learned" else None
 
     def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
@@ -71,4 +86,6 @@ class Background(nn.Module):
     def decode(self, z: Float[Tensor, "N Z"]) -> Float[Tensor, "N 3 H W"]:
         """z_bg -> RGB in [0, 1]."""
         logit = self.decoder(z)
+        if self.change == "shade":
+            logit = BRIGHTEST - F.softplus(-logit)  # no change at zero
         return torch.sigmoid(logit if self.bias_image is None else logit + self.bias_image)
