@@ -25,6 +25,7 @@ from apex_lab.benchmark.parts import PARTS
 from apex_lab.benchmark.work import Workload
 from apex_lab.config import check_job
 from apex_lab.errors import UserError
+from apex_lab.optimizers import Muon
 from tests.conftest import TINY, Ended, compose_job
 
 APEX = ("model=apex", "data=p2d", "scale=smoke", "trainer=cpu")
@@ -83,7 +84,7 @@ def test_nothing_in_the_training_step_waits_for_the_device(words: tuple[str, ...
     step()
     before = [p.detach().clone() for p in work.model.parameters()]
     assert work.optimizer is not None
-    # without the optimiser, which reads its step counts; they lie on the host, so that waits for nothing on a GPU
+    # without Adam, which reads its step counts; they lie on the host, so that waits for nothing on a GPU
     with no_synchronisation():
         work.optimizer.zero_grad(set_to_none=True)
         loss = work.learner.training_step(work.batch, 0)
@@ -91,6 +92,17 @@ def test_nothing_in_the_training_step_waits_for_the_device(words: tuple[str, ...
         work.learner.configure_gradient_clipping(work.optimizer)
     work.optimizer.step()
     assert any(not torch.equal(a, b) for a, b in zip(before, work.model.parameters(), strict=True))
+
+
+def test_nothing_in_an_update_by_muon_waits_for_the_device() -> None:
+    model = torch.nn.Sequential(torch.nn.Conv2d(3, 8, 3), torch.nn.Flatten(), torch.nn.Linear(32, 2))
+    optimizer = Muon(model.parameters())
+    model(torch.rand(5, 3, 4, 4)).square().sum().backward()
+    optimizer.step()
+    before = [p.detach().clone() for p in model.parameters()]
+    with no_synchronisation():
+        optimizer.step()
+    assert all(not torch.equal(a, b) for a, b in zip(before, model.parameters(), strict=True))
 
 
 @pytest.mark.parametrize(

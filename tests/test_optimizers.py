@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
+from apex_lab import components
+from apex_lab.errors import UserError
 from apex_lab.optimizers import QUINTIC, Muon, is_matrix, orthogonalised
 
 
@@ -37,6 +39,27 @@ def test_orthogonalised_does_not_depend_on_the_scale_and_leaves_zeros() -> None:
     x = torch.randn(4, 7, generator=torch.Generator().manual_seed(1))
     torch.testing.assert_close(orthogonalised(1e6 * x), orthogonalised(1e-6 * x))
     assert orthogonalised(torch.zeros(3, 4)).eq(0).all()
+
+
+def test_weights_whose_gradients_vanish_come_to_rest() -> None:
+    weight = nn.Parameter(torch.randn(64, 288, generator=torch.Generator().manual_seed(4)))
+    optimizer = Muon([weight])
+    weight.grad = 1e-3 * torch.randn(64, 288, generator=torch.Generator().manual_seed(5))
+    optimizer.step()
+    weight.grad = torch.zeros_like(weight)
+    for _ in range(600):
+        optimizer.step()
+    before = weight.detach().clone()
+    for _ in range(2000):
+        optimizer.step()
+    assert (weight - before).abs().max() < 1e-4
+    assert orthogonalised(1e-25 * torch.randn(64, 288)).abs().max() < 1e-12
+
+
+def test_too_many_iterations_are_refused() -> None:
+    node = {"_target_": "apex_lab.optimizers.Muon", "iterations": 9}
+    with pytest.raises(UserError, match=r"optimizer\.iterations = 9 is wrong"):
+        components.check(node, "optimizer", supplied=["params"])
 
 
 def test_which_weights_are_matrices() -> None:
@@ -150,6 +173,7 @@ def test_a_closure_is_called_with_gradients_on() -> None:
 
 
 @pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_it_moves_weights_on_a_gpu_as_on_the_cpu() -> None:
     here, there = small(), small().cuda()
     a, b = Muon(here.parameters()), Muon(there.parameters())

@@ -216,7 +216,7 @@ def build_weights(config: Config) -> dict[str, Callable[[int], float]]:
 
 
 def build_lr_scale(config: Config) -> Callable[[int], float]:
-    """What the learning rate is multiplied by, as a schedule."""
+    """What all learning rates are multiplied by, as a schedule."""
     return _build_value(config.lr_scale, "lr_scale")
 
 

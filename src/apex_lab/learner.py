@@ -41,7 +41,7 @@ class Learner(L.LightningModule):
         optimizer: weights -> optimiser over them.
         schedules: the values that the model's forward takes.
         weights: loss term -> its weight.
-        lr_scale: what the optimiser's learning rate is multiplied by.
+        lr_scale: what all of the optimiser's learning rates are multiplied by.
         seed: of the noise.
         gradient_clip_norm: gradients are scaled down to this norm; None leaves them.
         log_interval: steps between two logged steps.

@@ -21,17 +21,21 @@ Decay = Annotated[float, Field(ge=0, lt=1)]
 QUINTIC = (3.4445, -4.7750, 2.0315)
 """Coefficients of Jordan et al. 2024 (Muon): they bring singular values near 1 in few iterations, not exactly to 1."""
 
+NOTHING = 1e-7
+"""Norm below which a momentum counts for less and less, so that weights without gradients come to rest."""
+
 
 def orthogonalised(matrix: Float[Tensor, "rows columns"], iterations: int = 5) -> Float[Tensor, "rows columns"]:
-    """The matrix with its singular values brought near 1 (between about 0.7 and 1.2) and its singular vectors kept.
+    """The matrix with its singular values brought near 1 and its singular vectors kept.
 
-    Newton-Schulz iteration x <- (a + b x x^T + c (x x^T)^2) x, from singular values of at most 1, carried out on the
-    small square x x^T and applied to the matrix once. A matrix of zeros stays zero.
+    Five iterations bring singular values of 0.0015 to 1 times the Frobenius norm to between 0.68 and 1.2; smaller ones
+    are multiplied by at most 485. Newton-Schulz iteration x <- (a + b x x^T + c (x x^T)^2) x, carried out on the small
+    square x x^T and applied to the matrix once. A matrix whose norm is far below `NOTHING` goes to zero.
     """
     a, b, c = QUINTIC
     wide = matrix.shape[0] <= matrix.shape[1]
     x = matrix if wide else matrix.T
-    x = x / x.norm().clamp_min(torch.finfo(x.dtype).tiny)
+    x = x / x.norm().clamp_min(NOTHING)
     gram, applied = x @ x.T, torch.eye(len(x), dtype=x.dtype, device=x.device)
     for _ in range(iterations):
         step = torch.addmm(gram, gram, gram, beta=b, alpha=c)
@@ -50,8 +54,8 @@ class Muon(Optimizer):
     """Momentum, orthogonalised per weight matrix (Jordan et al. 2024); Adam for biases, gains and bias images.
 
     A matrix of `rows` x `columns` (a convolution: outputs x inputs times kernel) moves by its orthogonalised Nesterov
-    momentum times lr sqrt(max(1, rows / columns)), so every direction that its gradients agree on is learned at once,
-    however small its gradient.
+    momentum times lr sqrt(max(1, rows / columns)), so directions that its gradients agree on are learned at once, weak
+    ones too.
 
     Args:
         params: the weights.
@@ -60,7 +64,7 @@ class Muon(Optimizer):
         adam_lr: of everything else.
         beta1, beta2: Adam's.
         eps: Adam's.
-        iterations: of the orthogonalisation.
+        iterations: of the orthogonalisation; above 6, float32 does not carry it for matrices of low rank.
     """
 
     def __init__(
@@ -72,7 +76,7 @@ class Muon(Optimizer):
         beta1: Decay = 0.9,
         beta2: Decay = 0.999,
         eps: Positive = 1e-8,
-        iterations: Annotated[int, Field(ge=1)] = 5,
+        iterations: Annotated[int, Field(ge=1, le=6)] = 5,
     ) -> None:
         weights = list(params)
         matrices, others = [w for w in weights if is_matrix(w)], [w for w in weights if not is_matrix(w)]
@@ -111,9 +115,10 @@ class Muon(Optimizer):
     @staticmethod
     def _adam(weight: Tensor, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
         if not state:
-            state["step"] = torch.zeros((), device=weight.device)  # a tensor, as PyTorch's own: it lives in checkpoints
+            # not "step": PyTorch leaves a tensor of that name on the CPU when it loads a state
+            state["updates"] = torch.zeros((), device=weight.device, dtype=weight.dtype)
             state["mean"], state["square"] = torch.zeros_like(weight), torch.zeros_like(weight)
-        step, beta1, beta2 = state["step"].add_(1), group["beta1"], group["beta2"]
+        step, beta1, beta2 = state["updates"].add_(1), group["beta1"], group["beta2"]
         mean = state["mean"].lerp_(grad, 1 - beta1)
         square = state["square"].lerp_(grad.square(), 1 - beta2)
         spread = (square / (1 - beta2**step)).sqrt_().add_(group["eps"])

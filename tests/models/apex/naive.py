@@ -240,6 +240,8 @@ def explain(model: Apex, video: Tensor, p0: float) -> Told:
         if z_before is not None:
             prior = normal(model.background.transition(z_before))
         logit = model.background.decoder(z[None])[0]
+        if model.background.change == "shade":
+            logit = torch.log(2 / (1 + torch.exp(-logit)))
         backdrop = torch.sigmoid(logit + model.background.bias_image)
         z_before = z
 

@@ -7,9 +7,9 @@ import itertools
 import pytest
 import torch
 
-from apex_lab.models.apex import Apex
+from apex_lab.models.apex import Apex, Background
 from tests.models.apex import naive
-from tests.models.apex.small import SCHEDULE, lively, video
+from tests.models.apex.small import SCHEDULE, SIZE, lively, video
 
 P0 = float(SCHEDULE["discovery_presence"])
 
@@ -43,3 +43,10 @@ def test_masks_identities_and_every_term_of_the_objective(slots: int, render_top
         assert any(after - before for before, after in pairs)  # some come later
         assert 0.0 < min(one.contexts) < 0.5  # some cells are explained already
         assert max(one.contexts) > 0.9
+
+
+def test_with_a_background_that_is_a_shade() -> None:
+    torch.manual_seed(7)
+    background = Background(SIZE, 6, 6, change="shade")
+    background.initialise(0.2 + 0.6 * torch.rand(3, SIZE, SIZE))
+    check(lively(background=background).double().eval(), video(2, 4).double())

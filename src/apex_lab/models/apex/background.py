@@ -32,8 +32,9 @@ class Background(nn.Module):
             at the mean of the data. A convolutional decoder needs thousands of steps to draw sharp static edges, and
             until then the foreground explains them.
         change: what z_bg may do to the picture. `colour` is the paper's: anything. `shade` lets it darken or (less)
-            brighten the bias image, all channels of a pixel alike in their logits, which needs a `learned` one: that
-            draws cast shadows, and not the grey parts of a moving arm, which the foreground would then never explain.
+            brighten the bias image, all channels of a pixel alike in their logits, which needs a `learned` one. Over a
+            table that has a hue that draws cast shadows, but few of the grey parts of a moving arm, which `colour`
+            draws too, so that the foreground never explains them.
 
     Raises:
         ValueError: there is no bias image to shade.
@@ -49,7 +50,9 @@ class Background(nn.Module):
     ) -> None:
         super().__init__()
         if change == "shade" and bias_image == "none":
-            raise ValueError("change = 'shade' needs a bias image to shade: set bias_image = 'learned'")
+            raise ValueError(
+                "change = 'shade' needs a bias image to shade: set bias_image = 'learned' or change = 'colour'"
+            )
         self.change = change
         layers: list[nn.Module] = [conv_norm(4, width, kernel=5, stride=4)]
         side = image_size // 4
