@@ -40,10 +40,12 @@ class PlainMixture(MixtureLikelihood):
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
         background: Float[Tensor, "N 3 H W"],
+        scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N"]:
-        by_object = log_normal(image[:, None], objects, self.sigma_fg)
-        by_background = log_normal(image, background, self._sigma_bg(image, scale_bg))
+        sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
+        by_object = log_normal(image[:, None], objects, sigma_fg)
+        by_background = log_normal(image, background, sigma_bg)
         if self.mixture_over == "pixel":
             by_object, by_background = by_object.sum(2, keepdim=True), by_background.sum(1, keepdim=True)
         joint = torch.cat(
@@ -90,7 +92,7 @@ class Straightforward(Apex):
         look_at, follow_in, features = self._sources(video, i, memory)
         proposals = self.discovery(features, look_at[:, None], self.glimpses, self.appearance, self.training)
         step = self._infer(look_at, follow_in, proposals, memory, schedule)
-        return self._render(video[:, i : i + 1], proposals, step, memory, schedule["sigma_bg_scale"])
+        return self._render(video[:, i : i + 1], proposals, step, memory, schedule)
 
     def _sources(self, video: Tensor, i: int, memory: _Memory) -> tuple[Tensor, Tensor, Tensor]:
         """What is looked at in this frame and what is followed, (B, C, h, w), and its features (B, 1, F, h, w)."""
@@ -169,7 +171,7 @@ class Straightforward(Apex):
         proposals: Proposals,
         step: Step,
         memory: _Memory,
-        scale_bg: Tensor,
+        schedule: Schedule,
     ) -> Scene:
         """Rendering, likelihood, KL and the result of one frame."""
         steps = stack_steps([step])
@@ -179,7 +181,13 @@ class Straightforward(Apex):
         means = paster.each(colours)
         backdrop, kl_background = self._backdrop(frame[:, 0], masks, memory)
         log_likelihood = self.likelihood(
-            frame[:, 0], masks.log_objects[:, 0], means[:, 0], masks.log_background[:, 0], backdrop, scale_bg
+            frame[:, 0],
+            masks.log_objects[:, 0],
+            means[:, 0],
+            masks.log_background[:, 0],
+            backdrop,
+            schedule["sigma_fg_scale"],
+            schedule["sigma_bg_scale"],
         )
         slots = self.max_objects
         terms = {

@@ -114,18 +114,20 @@ def test_pixels_without_any_object_are_the_background_s_and_give_objects_no_grad
 
 
 @pytest.mark.parametrize("over", ["channel", "pixel"])
-def test_scale_bg_multiplies_sigma_bg_in_value_and_gradient(over: str) -> None:
+@pytest.mark.parametrize(("fg", "bg"), [(1.0, 1.6), (2.5, 1.0), (2.5, 1.6)])
+def test_scales_multiply_the_sigmas_in_value_and_gradient(over: str, fg: float, bg: float) -> None:
     found = []
-    for likelihood, scale in (
-        (MixtureLikelihood(0.4, 0.2, over), torch.tensor(1.6)),  # type: ignore[arg-type]
-        (MixtureLikelihood(0.4, 0.2 * 1.6, over), None),  # type: ignore[arg-type]
+    for likelihood, scales in (
+        (MixtureLikelihood(0.4, 0.2, over), (torch.tensor(fg), torch.tensor(bg))),  # type: ignore[arg-type]
+        (MixtureLikelihood(0.4 * fg, 0.2 * bg, over), ()),  # type: ignore[arg-type]
     ):
         leaves = [x.clone().requires_grad_() for x in case()]
-        out = likelihood(*leaves, scale)
+        out = likelihood(*leaves, *scales)
         found.append([out, *torch.autograd.grad(out.sum(), leaves)])
     for scaled, wide in zip(*found, strict=True):
         torch.testing.assert_close(scaled, wide, rtol=1e-6, atol=1e-6)
 
 
-def test_one_gaussian_has_no_background_to_widen() -> None:
-    assert torch.equal(GaussianLikelihood()(*case(), torch.tensor(3.0)), GaussianLikelihood()(*case()))
+def test_one_gaussian_has_no_sigmas_to_widen() -> None:
+    scales = torch.tensor(2.0), torch.tensor(3.0)
+    assert torch.equal(GaussianLikelihood()(*case(), *scales), GaussianLikelihood()(*case()))

@@ -219,12 +219,14 @@ def test_refusals() -> None:
         tiny()(torch.rand(1, 2, 3, 64, 64), SCHEDULE)
 
 
-def test_sigma_bg_scale_widens_the_background_of_the_whole_model() -> None:
-    def terms(sigma_bg: float, scale: float) -> dict[str, torch.Tensor]:
-        model = tiny(likelihood=MixtureLikelihood(0.1, sigma_bg)).eval()
-        return model(video(), {**SCHEDULE, "sigma_bg_scale": torch.tensor(scale)}).terms
+@pytest.mark.parametrize(("fg", "bg"), [(1.0, 1.6), (2.5, 1.0)])
+def test_the_scales_of_the_sigmas_widen_those_of_the_whole_model(fg: float, bg: float) -> None:
+    def terms(sigma_fg: float, sigma_bg: float, **scales: float) -> dict[str, torch.Tensor]:
+        model = tiny(likelihood=MixtureLikelihood(sigma_fg, sigma_bg)).eval()
+        return model(video(), {**SCHEDULE, **{name: torch.tensor(scale) for name, scale in scales.items()}}).terms
 
-    scaled, wide, narrow = terms(0.05, 1.6), terms(0.08, 1.0), terms(0.05, 1.0)
+    scaled = terms(0.1, 0.05, sigma_fg_scale=fg, sigma_bg_scale=bg)
+    wide, narrow = terms(0.1 * fg, 0.05 * bg), terms(0.1, 0.05)
     for name, value in wide.items():
         torch.testing.assert_close(scaled[name], value, rtol=1e-5, atol=1e-3)
     assert not torch.allclose(scaled["nll"], narrow["nll"])

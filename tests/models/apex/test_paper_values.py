@@ -29,4 +29,5 @@ def test_schedules_at_the_paper_s_scale() -> None:
     assert [p0(s) for s in (0, 5_000, 10_000, 40_000)] == pytest.approx([0.1, 0.01, 1e-3, 1e-3])
     assert [schedules["carry"](s) for s in (0, 500, 40_000)] == [1.0, 1.0, 1.0]  # full sequences
     assert [schedules["discover"](s) for s in (0, 500, 40_000)] == [1.0, 1.0, 1.0]
-    assert [schedules["sigma_bg_scale"](s) for s in (0, 500, 40_000)] == [1.0, 1.0, 1.0]
+    for sigma in ("sigma_fg_scale", "sigma_bg_scale"):
+        assert [schedules[sigma](s) for s in (0, 500, 40_000)] == [1.0, 1.0, 1.0]

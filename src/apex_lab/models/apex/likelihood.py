@@ -35,13 +35,13 @@ class _LogMixture(torch.autograd.Function):
         objects: Tensor,
         log_background: Tensor,
         background: Tensor,
-        sigma_fg: float,
+        sigma_fg: Tensor,
         sigma_bg: Tensor,
     ) -> Tensor:
-        """Shapes as in `Likelihood.__call__`, sigma_bg 0-dim -> log density (N, 3, H, W) in nats."""
+        """Shapes as in `Likelihood.__call__`, sigmas 0-dim -> log density (N, 3, H, W) in nats."""
         from_objects = image[:, None] - objects
         from_background = image - background
-        by_object = from_objects.square().mul_(-0.5 / sigma_fg**2).add_((log_objects - math.log(sigma_fg))[:, :, None])
+        by_object = from_objects.square().mul_(-0.5 / sigma_fg**2).add_((log_objects - sigma_fg.log())[:, :, None])
         by_background = from_background.square().mul_(-0.5 / sigma_bg**2)
         by_background += (log_background - sigma_bg.log())[:, None]
         highest = torch.maximum(by_object.amax(1), by_background)
@@ -77,6 +77,7 @@ class Likelihood(ABC):
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
         background: Float[Tensor, "N 3 H W"],
+        scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N"]:
         """Log-likelihood of each image in nats.
@@ -87,7 +88,8 @@ class Likelihood(ABC):
             objects: their means, RGB in [0, 1].
             log_background: log mask of the background; finite.
             background: its mean.
-            scale_bg: what sigma_bg is multiplied by, where a likelihood has one; None leaves it.
+            scale_fg, scale_bg: what sigma_fg and sigma_bg are multiplied by, where a likelihood has them; None leaves
+                them.
         """
 
 
@@ -104,9 +106,9 @@ class MixtureLikelihood(Likelihood):
     ) -> None:
         self.sigma_fg, self.sigma_bg, self.mixture_over = sigma_fg, sigma_bg, mixture_over
 
-    def _sigma_bg(self, like: Tensor, scale: Tensor | None) -> Tensor:
-        own = like.new_full((), self.sigma_bg)
-        return own if scale is None else own * scale
+    def _sigmas(self, like: Tensor, scale_fg: Tensor | None, scale_bg: Tensor | None) -> tuple[Tensor, Tensor]:
+        fg, bg = like.new_full((), self.sigma_fg), like.new_full((), self.sigma_bg)
+        return (fg if scale_fg is None else fg * scale_fg), (bg if scale_bg is None else bg * scale_bg)
 
     def __call__(
         self,
@@ -115,13 +117,14 @@ class MixtureLikelihood(Likelihood):
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
         background: Float[Tensor, "N 3 H W"],
+        scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N"]:
-        sigma_bg = self._sigma_bg(image, scale_bg)
+        sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
         if self.mixture_over == "channel":
-            args = (image, log_objects, objects, log_background, background, self.sigma_fg, sigma_bg)
+            args = (image, log_objects, objects, log_background, background, sigma_fg, sigma_bg)
             return _LogMixture.apply(*args).flatten(1).sum(1)
-        by_object = log_normal(image[:, None], objects, self.sigma_fg).sum(2)
+        by_object = log_normal(image[:, None], objects, sigma_fg).sum(2)
         by_background = log_normal(image, background, sigma_bg).sum(1)
         # One sum over all components: over the objects alone it has no gradient where all their masks are zero.
         parts = torch.cat([by_object + log_objects, (by_background + log_background)[:, None]], dim=1)
@@ -145,6 +148,7 @@ class GaussianLikelihood(Likelihood):
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
         background: Float[Tensor, "N 3 H W"],
+        scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N"]:
         blend = (log_objects.exp()[:, :, None] * objects).sum(1) + log_background.exp()[:, None] * background

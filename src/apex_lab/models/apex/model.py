@@ -73,12 +73,13 @@ class Apex(SceneModel):
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
-    schedule_names = ("temperature", "discovery_presence", "carry", "discover", "sigma_bg_scale")
+    schedule_names = ("temperature", "discovery_presence", "carry", "discover", "sigma_fg_scale", "sigma_bg_scale")
     schedule_ranges: ClassVar = {
         "temperature": (0.01, 100.0),
         "discovery_presence": (0.0, 1.0),
         "carry": (0.0, 1.0),
         "discover": (0.0, 1.0),
+        "sigma_fg_scale": (0.01, 100.0),
         "sigma_bg_scale": (0.01, 100.0),
     }
     """Smallest and largest value that each schedule may take in a run."""
@@ -143,8 +144,10 @@ class Apex(SceneModel):
             schedule: `temperature` of the relaxed Bernoulli; `discovery_presence` p0; `carry`, the probability in
                 [0, 1] with which a video's objects are carried into the next frame in training (see `_carried_on`);
                 `discover`, the probability in [0, 1] with which a carried video may discover too (see `_may_discover`);
-                `sigma_bg_scale`, what the mixture's sigma_bg is multiplied by (above 1 the background first learns what
-                it can, such as cast shadows, before objects are asked to explain the rest).
+                `sigma_fg_scale` and `sigma_bg_scale`, what the mixture's sigmas are multiplied by. A wide sigma_bg: the
+                background first learns what it can, such as cast shadows, before objects are asked to explain the rest.
+                A wide sigma_fg: while objects cannot be drawn well yet, two components of half an object gain less
+                likelihood over one of the whole than the second one costs.
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
@@ -281,6 +284,7 @@ class Apex(SceneModel):
             means.flatten(0, 1),
             masks.log_background.flatten(0, 1),
             backdrop,
+            schedule["sigma_fg_scale"],
             schedule["sigma_bg_scale"],
         )
         slots = self.max_objects
