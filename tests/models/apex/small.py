@@ -28,7 +28,14 @@ from apex_lab.scene import Scene, Schedule, schedule_at
 
 SIZE = 32
 SCHEDULE = schedule_at(
-    {"temperature": 0.7, "discovery_presence": 0.1, "carry": 1.0, "discover": 0.8, "sigma_fg_scale": 1.0, "sigma_bg_scale": 1.0}
+    {
+        "temperature": 0.7,
+        "discovery_presence": 0.1,
+        "carry": 1.0,
+        "discover": 0.8,
+        "sigma_fg_scale": 1.0,
+        "sigma_bg_scale": 1.0,
+    }
 )
 
 

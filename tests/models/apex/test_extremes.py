@@ -15,7 +15,14 @@ from apex_lab.scene import schedule_at
 from tests.models.apex.small import SIZE, tiny, video
 
 COLD = schedule_at(
-    {"temperature": 0.3, "discovery_presence": 1e-3, "carry": 1.0, "discover": 0.5, "sigma_fg_scale": 1.0, "sigma_bg_scale": 1.0}
+    {
+        "temperature": 0.3,
+        "discovery_presence": 1e-3,
+        "carry": 1.0,
+        "discover": 0.5,
+        "sigma_fg_scale": 1.0,
+        "sigma_bg_scale": 1.0,
+    }
 )
 
 

@@ -15,7 +15,16 @@ from tests.models.apex import naive
 from tests.models.apex.small import SCHEDULE, SIZE, Inside, lively, video
 
 P0 = 0.1
-OPEN = schedule_at({"temperature": 0.7, "discovery_presence": P0, "carry": 1.0, "discover": 1.0, "sigma_fg_scale": 1.0, "sigma_bg_scale": 1.0})
+OPEN = schedule_at(
+    {
+        "temperature": 0.7,
+        "discovery_presence": P0,
+        "carry": 1.0,
+        "discover": 1.0,
+        "sigma_fg_scale": 1.0,
+        "sigma_bg_scale": 1.0,
+    }
+)
 
 
 def trained(model: Apex, seed: int = 0) -> Inside:

@@ -95,7 +95,14 @@ def follow(model: Apex, x: Tensor) -> Scene:
     return model(
         x,
         schedule_at(
-            {"temperature": 0.1, "discovery_presence": 1e-3, "carry": 1.0, "discover": 0.0, "sigma_fg_scale": 1.0, "sigma_bg_scale": 1.0}
+            {
+                "temperature": 0.1,
+                "discovery_presence": 1e-3,
+                "carry": 1.0,
+                "discover": 0.0,
+                "sigma_fg_scale": 1.0,
+                "sigma_bg_scale": 1.0,
+            }
         ),
     )
 
