@@ -13,7 +13,7 @@ import yaml
 
 from apex_lab import components
 from apex_lab.config import conf_dir
-from apex_lab.data import P2DModule
+from apex_lab.data import P2DModule, ShortClips
 from apex_lab.data import module as code
 from apex_lab.errors import UserError
 from sims.p2d.settings import Settings
@@ -84,6 +84,23 @@ def test_a_resumed_run_sees_the_batches_of_an_unbroken_one(ready: P2DModule):
     for resumed, expected in zip(loader, unbroken[4:], strict=True):
         torch.testing.assert_close(resumed["video"], expected)
         assert resumed["video"].shape == (2, 3, 3, 16, 16)
+
+
+def test_short_clips_come_first_and_whole_videos_after_them(ready: P2DModule, made: Path):
+    data = module(made, short_clips=ShortClips(frames=2, batch_size=3, steps=2))
+    data.setup()
+    data.max_steps = 4
+    batches = list(data.train_dataloader())
+    assert [batch["video"].shape[:2] for batch in batches] == [(3, 2), (3, 2), (2, 3), (2, 3)]
+    for batch in batches:
+        for video, index in zip(batch["video"], batch["index"], strict=True):
+            whole = ready.sets["train"][int(index)]["video"]
+            assert any(torch.equal(video, whole[start : start + len(video)]) for start in range(3 - len(video) + 1))
+
+
+def test_clips_longer_than_the_videos_are_refused_at_once(tmp_path: Path):
+    with pytest.raises(UserError, match=r"short_clips\.frames=4 is more than a video has: frames=3"):
+        module(tmp_path, short_clips=ShortClips(frames=4, batch_size=3, steps=2))
 
 
 def test_the_order_depends_on_the_seed_of_the_run(made: Path, ready: P2DModule):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from apex_lab.data.batches import ShortClips
 from apex_lab.data.p2d import P2D
 
 if TYPE_CHECKING:
     from apex_lab.data.module import P2DModule
 
-__all__ = ["P2D", "P2DModule"]
+__all__ = ["P2D", "P2DModule", "ShortClips"]
 
 
 def __getattr__(name: str) -> Any:

@@ -3,34 +3,90 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field
 from torch.utils.data import Sampler
 
+Count = Annotated[int, Field(gt=0)]
 
-class TrainBatches(Sampler[list[int]]):
-    """Batches for the steps from `start_step` up to `max_steps`.
 
-    The videos of all epochs form one endless row, each epoch in an order drawn from (seed, epoch); step n takes the
-    n-th stretch of `batch_size` of them. So every video is used equally often, no batch is short, and nothing needs
-    to be remembered to go on.
+class Clip(NamedTuple):
+    """A stretch of one video: its number, the first frame and how many."""
+
+    video: int
+    start: int
+    frames: int
+
+
+@dataclass(frozen=True)
+class ShortClips:
+    """Batches of many short clips for the first steps of a training, before whole videos.
+
+    Neighbouring frames are nearly alike: while frames are explained by themselves, 8 clips of 2 frames teach more than
+    2 videos of 8, at the same cost.
+
+    Args:
+        frames: length of a clip; its first frame is drawn.
+        batch_size: clips per step, each from a video of its own.
+        steps: how many steps they last.
     """
 
-    def __init__(self, size: int, batch_size: int, seed: int, start_step: int, max_steps: int) -> None:
-        self.size, self.batch_size, self.seed = size, batch_size, seed
-        self.start_step, self.max_steps = start_step, max_steps
+    frames: Count
+    batch_size: Count
+    steps: Count
+
+
+class TrainBatches(Sampler[list[Clip]]):
+    """Batches for the steps from `start_step` up to `max_steps`.
+
+    The videos of all epochs form one endless row, each epoch in an order drawn from (seed, epoch); each step takes the
+    next stretch of it. So every video is used equally often, no batch is short, and nothing needs to be remembered to
+    go on.
+
+    Args:
+        size: number of videos.
+        frames: of each video.
+        batch_size: whole videos per step.
+        seed: of the order and of the clips' first frames.
+        start_step: step of the first batch.
+        max_steps: step before which the batches end.
+        short: clips of the first steps; None: whole videos from the start.
+    """
+
+    def __init__(
+        self,
+        size: int,
+        frames: int,
+        batch_size: int,
+        seed: int,
+        start_step: int,
+        max_steps: int,
+        short: ShortClips | None = None,
+    ) -> None:
+        self.size, self.frames, self.batch_size, self.seed = size, frames, batch_size, seed
+        self.start_step, self.max_steps, self.short = start_step, max_steps, short
         self._order = lru_cache(maxsize=2)(self._draw)
 
-    def batch(self, step: int) -> list[int]:
-        """Indices of the videos of one step's batch."""
-        first = step * self.batch_size
-        return [
-            int(self._order(position // self.size)[position % self.size])
-            for position in range(first, first + self.batch_size)
-        ]
+    def batch(self, step: int) -> list[Clip]:
+        """The clips of one step's batch, all of one length."""
+        if self.short is not None and step < self.short.steps:
+            count, frames = self.short.batch_size, self.short.frames
+            first = step * count
+            starts = np.random.default_rng([self.seed, step, frames]).integers(self.frames - frames + 1, size=count)
+        else:
+            count, frames = self.batch_size, self.frames
+            first = step * count
+            if self.short is not None:
+                first += self.short.steps * (self.short.batch_size - count)
+            starts = np.zeros(count, dtype=int)
+        videos = [self._order(place // self.size)[place % self.size] for place in range(first, first + count)]
+        return [Clip(int(video), int(start), frames) for video, start in zip(videos, starts, strict=True)]
 
-    def __iter__(self) -> Iterator[list[int]]:
+    def __iter__(self) -> Iterator[list[Clip]]:
         for step in range(self.start_step, self.max_steps):
             yield self.batch(step)
 
