@@ -29,13 +29,13 @@ def test_going_on_at_any_step_gives_the_batches_of_an_unbroken_run(
     resumed = TrainBatches(size, FRAMES, batch_size, seed, start, start + more, short)
     assert list(resumed) == unbroken[start:]
     assert len(resumed) == more
-    first = short.steps if short else 0
+    first = short["steps"] if short else 0
     assert all(len(batch) == batch_size for batch in unbroken[first:])
     assert all(clip[1:] == (0, FRAMES) for batch in unbroken[first:] for clip in batch)
     for batch in unbroken[:first]:
         assert short is not None
-        assert len(batch) == short.batch_size
-        assert all(clip.frames == short.frames and 0 <= clip.start <= FRAMES - short.frames for clip in batch)
+        assert len(batch) == short["batch_size"]
+        assert all(clip.frames == short["frames"] and 0 <= clip.start <= FRAMES - short["frames"] for clip in batch)
 
 
 @given(st.integers(1, 30), st.integers(1, 12), st.integers(0, 5), SHORT)

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from apex_lab.data.batches import ShortClips
 from apex_lab.data.p2d import P2D
 
 if TYPE_CHECKING:
     from apex_lab.data.module import P2DModule
 
-__all__ = ["P2D", "P2DModule", "ShortClips"]
+__all__ = ["P2D", "P2DModule"]
 
 
 def __getattr__(name: str) -> Any:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
 from torch.utils.data import Sampler
+from typing_extensions import TypedDict  # pydantic takes Python's own from 3.12 on only
 
 Count = Annotated[int, Field(gt=0)]
 
@@ -22,17 +22,14 @@ class Clip(NamedTuple):
     frames: int
 
 
-@dataclass(frozen=True)
-class ShortClips:
+class ShortClips(TypedDict):
     """Batches of many short clips for the first steps of a training, before whole videos.
 
     Neighbouring frames are nearly alike: while frames are explained by themselves, 8 clips of 2 frames teach more than
     2 videos of 8, at the same cost.
 
-    Args:
-        frames: length of a clip; its first frame is drawn.
-        batch_size: clips per step, each from a video of its own.
-        steps: how many steps they last.
+    frames: length of a clip; its first frame is drawn. batch_size: clips per step, each from the next video.
+    steps: how many steps they last.
     """
 
     frames: Count
@@ -73,15 +70,15 @@ class TrainBatches(Sampler[list[Clip]]):
 
     def batch(self, step: int) -> list[Clip]:
         """The clips of one step's batch, all of one length."""
-        if self.short is not None and step < self.short.steps:
-            count, frames = self.short.batch_size, self.short.frames
+        if self.short is not None and step < self.short["steps"]:
+            count, frames = self.short["batch_size"], self.short["frames"]
             first = step * count
             starts = np.random.default_rng([self.seed, step, frames]).integers(self.frames - frames + 1, size=count)
         else:
             count, frames = self.batch_size, self.frames
             first = step * count
             if self.short is not None:
-                first += self.short.steps * (self.short.batch_size - count)
+                first += self.short["steps"] * (self.short["batch_size"] - count)
             starts = np.zeros(count, dtype=int)
         videos = [self._order(place // self.size)[place % self.size] for place in range(first, first + count)]
         return [Clip(int(video), int(start), frames) for video, start in zip(videos, starts, strict=True)]

@@ -82,8 +82,8 @@ class P2DModule(LightningDataModule):
         self.settings = _settings({"seed": data_seed, **sizes}, simulation or {})
         self.seed, self.workers = seed, workers
         self.batch_size, self.eval_batch_size = batch_size, eval_batch_size or batch_size
-        if short_clips is not None and short_clips.frames > frames:
-            raise UserError(f"short_clips.frames={short_clips.frames} is more than a video has: frames={frames}")
+        if short_clips is not None and short_clips["frames"] > frames:
+            raise UserError(f"short_clips.frames={short_clips['frames']} is more than a video has: frames={frames}")
         self.short_clips = short_clips
         self.generate, self.sim_workers, self.verify = generate, sim_workers, verify
         name = f"p2d_{image_size}px_{frames}f_{fingerprint(self.settings)[:8]}"
