@@ -29,7 +29,8 @@ def pair(*words: str, render_top: int | None = None) -> tuple[Apex, Straightforw
     variant = build_model(plain)
     assert isinstance(variant, Straightforward)
     variant.load_state_dict(model.state_dict())
-    return model, variant, schedule_at({name: value(3) for name, value in build_schedules(job.config).items()})
+    schedule = {name: value(3) for name, value in build_schedules(job.config).items()}
+    return model, variant, schedule_at({**schedule, "sigma_fg_scale": 2.5, "sigma_bg_scale": 1.6})
 
 
 VIDEO = torch.rand(3, 4, 3, 32, 32, generator=torch.Generator().manual_seed(1))

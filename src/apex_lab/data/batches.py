@@ -25,8 +25,8 @@ class Clip(NamedTuple):
 class ShortClips(TypedDict):
     """Batches of many short clips for the first steps of a training, before whole videos.
 
-    Neighbouring frames are nearly alike: while frames are explained by themselves, 8 clips of 2 frames teach more than
-    2 videos of 8, at the same cost.
+    Neighbouring frames are nearly alike: 8 clips of 2 frames show more than 2 videos of 8, at the same cost. A compiled
+    model compiles anew where they end. A run that is no longer than `steps` never sees a whole video.
 
     frames: length of a clip; its first frame is drawn. batch_size: clips per step, each from the next video.
     steps: how many steps they last.
@@ -37,7 +37,7 @@ class ShortClips(TypedDict):
     steps: Count
 
 
-class TrainBatches(Sampler[list[Clip]]):
+class TrainBatches(Sampler[list[int] | list[Clip]]):
     """Batches for the steps from `start_step` up to `max_steps`.
 
     The videos of all epochs form one endless row, each epoch in an order drawn from (seed, epoch); each step takes the
@@ -51,7 +51,7 @@ class TrainBatches(Sampler[list[Clip]]):
         seed: of the order and of the clips' first frames.
         start_step: step of the first batch.
         max_steps: step before which the batches end.
-        short: clips of the first steps; None: whole videos from the start.
+        short: clips of the first steps; None: whole videos from the start, and batches are plain numbers of videos.
     """
 
     def __init__(
@@ -68,22 +68,25 @@ class TrainBatches(Sampler[list[Clip]]):
         self.start_step, self.max_steps, self.short = start_step, max_steps, short
         self._order = lru_cache(maxsize=2)(self._draw)
 
-    def batch(self, step: int) -> list[Clip]:
-        """The clips of one step's batch, all of one length."""
-        if self.short is not None and step < self.short["steps"]:
+    def batch(self, step: int) -> list[int] | list[Clip]:
+        """The videos of one step's batch, or clips of one length."""
+        if self.short is None:
+            return self._videos(step * self.batch_size, self.batch_size)
+        if step < self.short["steps"]:
             count, frames = self.short["batch_size"], self.short["frames"]
             first = step * count
             starts = np.random.default_rng([self.seed, step, frames]).integers(self.frames - frames + 1, size=count)
         else:
             count, frames = self.batch_size, self.frames
-            first = step * count
-            if self.short is not None:
-                first += self.short["steps"] * (self.short["batch_size"] - count)
+            first = self.short["steps"] * self.short["batch_size"] + (step - self.short["steps"]) * count
             starts = np.zeros(count, dtype=int)
-        videos = [self._order(place // self.size)[place % self.size] for place in range(first, first + count)]
-        return [Clip(int(video), int(start), frames) for video, start in zip(videos, starts, strict=True)]
+        videos = self._videos(first, count)
+        return [Clip(video, int(start), frames) for video, start in zip(videos, starts, strict=True)]
 
-    def __iter__(self) -> Iterator[list[Clip]]:
+    def _videos(self, first: int, count: int) -> list[int]:
+        return [int(self._order(place // self.size)[place % self.size]) for place in range(first, first + count)]
+
+    def __iter__(self) -> Iterator[list[int] | list[Clip]]:
         for step in range(self.start_step, self.max_steps):
             yield self.batch(step)
 

@@ -69,9 +69,14 @@ def frame_masks(
     return [power / total * m_fg for power in powers], m_fg, 1 - m_fg
 
 
-def log_likelihood(image: Tensor, masks: list[Tensor], means: list[Tensor], likelihood: MixtureLikelihood) -> float:
-    """Eq. 1, pixel by pixel and channel by channel; the last mask and mean are the background's."""
-    sigmas = [likelihood.sigma_fg] * (len(masks) - 1) + [likelihood.sigma_bg]
+def log_likelihood(
+    image: Tensor, masks: list[Tensor], means: list[Tensor], likelihood: MixtureLikelihood, scales: tuple[float, float]
+) -> float:
+    """Eq. 1, pixel by pixel and channel by channel; the last mask and mean are the background's.
+
+    scales: what sigma_fg and sigma_bg are multiplied by.
+    """
+    sigmas = [likelihood.sigma_fg * scales[0]] * (len(masks) - 1) + [likelihood.sigma_bg * scales[1]]
     flat_masks = [m.flatten().tolist() for m in masks]
     total = 0.0
     for channel in range(3):
@@ -209,7 +214,7 @@ def discover(model: Apex, e: Tensor, scope: Tensor, p0: float, told: Told) -> li
 
 
 @torch.no_grad()
-def explain(model: Apex, video: Tensor, p0: float) -> Told:
+def explain(model: Apex, video: Tensor, p0: float, scales: tuple[float, float]) -> Told:
     """The whole of APEX for a video (T, 3, H, W)."""
     told, size = Told(), model.image_size
     assert isinstance(model.masks, ApexNormalisation)
@@ -245,7 +250,7 @@ def explain(model: Apex, video: Tensor, p0: float) -> Told:
         backdrop = torch.sigmoid(logit + model.background.bias_image)
         z_before = z
 
-        told.terms["nll"] -= log_likelihood(image, [*masks, m_bg], [*means, backdrop], model.likelihood)
+        told.terms["nll"] -= log_likelihood(image, [*masks, m_bg], [*means, backdrop], model.likelihood, scales)
         told.terms["mask_entropy"] += entropy(masks, m_fg)
         told.terms["kl_background"] += kl_normal(q_background, prior)
 

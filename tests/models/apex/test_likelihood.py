@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from apex_lab.models.apex.likelihood import GaussianLikelihood, MixtureLikelihood, log_normal
+from apex_lab.models.apex.likelihood import GaussianLikelihood, Likelihood, MixtureLikelihood, log_normal
 
 
 def case(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
@@ -128,6 +128,18 @@ def test_scales_multiply_the_sigmas_in_value_and_gradient(over: str, fg: float, 
         torch.testing.assert_close(scaled, wide, rtol=1e-6, atol=1e-6)
 
 
-def test_one_gaussian_has_no_sigmas_to_widen() -> None:
+def test_the_one_sigma_of_a_gaussian_is_that_of_the_objects() -> None:
     scales = torch.tensor(2.0), torch.tensor(3.0)
-    assert torch.equal(GaussianLikelihood()(*case(), *scales), GaussianLikelihood()(*case()))
+    torch.testing.assert_close(GaussianLikelihood(0.1)(*case(), *scales), GaussianLikelihood(0.2)(*case()))
+
+
+@pytest.mark.parametrize(
+    "likelihood", [MixtureLikelihood(), MixtureLikelihood(0.1, 0.04, "pixel"), GaussianLikelihood()]
+)
+def test_no_gradient_goes_to_the_scales(likelihood: Likelihood) -> None:
+    means = case()[2].requires_grad_()
+    inputs = [*case()[:2], means, *case()[3:]]
+    scales = [torch.tensor(2.0, requires_grad=True), torch.tensor(3.0, requires_grad=True)]
+    likelihood(*inputs, *scales).sum().backward()
+    assert means.grad is not None
+    assert all(scale.grad is None for scale in scales)

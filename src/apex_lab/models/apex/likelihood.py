@@ -66,6 +66,10 @@ class _LogMixture(torch.autograd.Function):
         return to_image, to_log_objects, to_objects, to_log_background, to_background, None, None
 
 
+def _scaled(sigma: Tensor, scale: Tensor | None) -> Tensor:
+    return sigma if scale is None else sigma * scale.detach()
+
+
 class Likelihood(ABC):
     """log p(x | masks, means), summed over pixels and channels."""
 
@@ -88,8 +92,7 @@ class Likelihood(ABC):
             objects: their means, RGB in [0, 1].
             log_background: log mask of the background; finite.
             background: its mean.
-            scale_fg, scale_bg: what sigma_fg and sigma_bg are multiplied by, where a likelihood has them; None leaves
-                them.
+            scale_fg, scale_bg: what sigma_fg and sigma_bg are multiplied by; None leaves them. No gradient goes there.
         """
 
 
@@ -108,7 +111,7 @@ class MixtureLikelihood(Likelihood):
 
     def _sigmas(self, like: Tensor, scale_fg: Tensor | None, scale_bg: Tensor | None) -> tuple[Tensor, Tensor]:
         fg, bg = like.new_full((), self.sigma_fg), like.new_full((), self.sigma_bg)
-        return (fg if scale_fg is None else fg * scale_fg), (bg if scale_bg is None else bg * scale_bg)
+        return _scaled(fg, scale_fg), _scaled(bg, scale_bg)
 
     def __call__(
         self,
@@ -135,7 +138,8 @@ class GaussianLikelihood(Likelihood):
     """One Gaussian around the blended picture, N(x; sum_k m_k mu_k, sigma^2): the `gaussian` ablation.
 
     Args:
-        sigma: standard deviation in units of RGB in [0, 1]; the paper names none, default sigma_fg.
+        sigma: standard deviation in units of RGB in [0, 1]; the paper names none, default sigma_fg. So it is what
+            `scale_fg` multiplies; there is no sigma_bg.
     """
 
     def __init__(self, sigma: Sigma = 0.1) -> None:
@@ -152,4 +156,5 @@ class GaussianLikelihood(Likelihood):
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N"]:
         blend = (log_objects.exp()[:, :, None] * objects).sum(1) + log_background.exp()[:, None] * background
-        return log_normal(image, blend, self.sigma).flatten(1).sum(1)
+        sigma = _scaled(image.new_full((), self.sigma), scale_fg)
+        return log_normal(image, blend, sigma).flatten(1).sum(1)

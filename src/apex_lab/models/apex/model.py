@@ -144,10 +144,10 @@ class Apex(SceneModel):
             schedule: `temperature` of the relaxed Bernoulli; `discovery_presence` p0; `carry`, the probability in
                 [0, 1] with which a video's objects are carried into the next frame in training (see `_carried_on`);
                 `discover`, the probability in [0, 1] with which a carried video may discover too (see `_may_discover`);
-                `sigma_fg_scale` and `sigma_bg_scale`, what the mixture's sigmas are multiplied by. A wide sigma_bg: the
-                background first learns what it can, such as cast shadows, before objects are asked to explain the rest.
-                A wide sigma_fg: while objects cannot be drawn well yet, two components of half an object gain less
-                likelihood over one of the whole than the second one costs.
+                `sigma_fg_scale` and `sigma_bg_scale`, what the likelihood's sigmas are multiplied by. A wide sigma_bg:
+                the background first learns what it can, such as cast shadows, before objects are asked to explain the
+                rest. A wide sigma_fg: while objects cannot be drawn well yet, two components of half an object gain
+                less likelihood over one of the whole than the second one costs.
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
