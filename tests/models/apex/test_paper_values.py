@@ -31,3 +31,10 @@ def test_schedules_at_the_paper_s_scale() -> None:
     assert [schedules["discover"](s) for s in (0, 500, 40_000)] == [1.0, 1.0, 1.0]
     for sigma in ("sigma_fg_scale", "sigma_bg_scale"):
         assert [schedules[sigma](s) for s in (0, 500, 40_000)] == [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(("scale", "first", "last"), [("paper", 1.0, 1.0), ("cpu", 2.0, 1.0), ("quickstart", 2.0, 2.0)])
+def test_sigma_fg_at_the_ends_of_a_training(scale: str, first: float, last: float) -> None:
+    config = resolved("model=apex", "data=p2d", f"scale={scale}")
+    sigma_fg = components.build(config["schedule"]["sigma_fg_scale"], "schedule.sigma_fg_scale")
+    assert (sigma_fg(0), sigma_fg(config["trainer"]["max_steps"])) == (first, last)
