@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +22,10 @@ import tests.typechecked
 install_import_hook("apex_lab", f"{tests.typechecked.__name__}.checked")
 
 from apex_lab.config import Job, check_job, conf_dir, plain  # noqa: E402
+
+# A shell without job control starts background jobs deaf to Ctrl-C, and processes that tests start would inherit that.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REPOSITORY = Path(__file__).parent.parent
 TINY = (
