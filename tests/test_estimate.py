@@ -26,14 +26,6 @@ def test_a_step_is_scaled_up_to_the_whole() -> None:
     assert 0.01 * 20 * 4 * 1000 < seconds < 5 * 0.01 * 20 * 4 * 1000
 
 
-def test_short_clips_are_counted_as_what_they_are() -> None:
-    words = ("data=p2d", "model=apex", "data.frames=20", "data.batch_size=4", "trainer.max_steps=100")
-    assert estimate.frames_seen(compose_job(*words).config) == 100 * 4 * 20
-    for steps, frames in ((30, 30 * 8 * 2 + 70 * 4 * 20), (200, 100 * 8 * 2)):
-        short = f"data.short_clips={{frames:2,batch_size:8,steps:{steps}}}"
-        assert estimate.frames_seen(compose_job(*words, short).config) == frames
-
-
 def test_measuring_leaves_model_and_noise_alone() -> None:
     config = compose_job().config
     model = build_model(config)

@@ -32,15 +32,8 @@ def warning(config: Config, model: SceneModel) -> str | None:
 
 def pixels(config: Config) -> int:
     """Pixels that training looks at, each batch counted."""
-    return frames_seen(config) * config.data["image_size"] ** 2
-
-
-def frames_seen(config: Config) -> int:
-    """Frames of all training batches."""
-    data, steps = config.data, config.trainer.max_steps
-    short = data.get("short_clips") or {"steps": 0, "batch_size": 0, "frames": 0}
-    first = min(short["steps"], steps)
-    return first * short["batch_size"] * short["frames"] + (steps - first) * data["batch_size"] * data["frames"]
+    data = config.data
+    return config.trainer.max_steps * data["batch_size"] * data["frames"] * data["image_size"] ** 2
 
 
 def seconds_on_cpu(config: Config, model: SceneModel) -> float:
@@ -56,7 +49,7 @@ def seconds_on_cpu(config: Config, model: SceneModel) -> float:
             terms = model(video, schedule).terms
             torch.stack([terms[name].sum() * weight for name, weight in weights.items()]).sum().backward()
             seconds = time.perf_counter() - began
-    return seconds / frames * frames_seen(config)
+    return seconds / frames * config.data["frames"] * config.data["batch_size"] * config.trainer.max_steps
 
 
 def readable(seconds: float) -> str:

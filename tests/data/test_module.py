@@ -86,23 +86,6 @@ def test_a_resumed_run_sees_the_batches_of_an_unbroken_one(ready: P2DModule):
         assert resumed["video"].shape == (2, 3, 3, 16, 16)
 
 
-def test_short_clips_come_first_and_whole_videos_after_them(ready: P2DModule, made: Path):
-    data = module(made, short_clips={"frames": 2, "batch_size": 3, "steps": 2})
-    data.setup()
-    data.max_steps = 4
-    batches = list(data.train_dataloader())
-    assert [batch["video"].shape[:2] for batch in batches] == [(3, 2), (3, 2), (2, 3), (2, 3)]
-    for batch in batches:
-        for video, index in zip(batch["video"], batch["index"], strict=True):
-            whole = ready.sets["train"][int(index)]["video"]
-            assert any(torch.equal(video, whole[start : start + len(video)]) for start in range(3 - len(video) + 1))
-
-
-def test_clips_longer_than_the_videos_are_refused_at_once(tmp_path: Path):
-    with pytest.raises(UserError, match=r"short_clips\.frames=4 is more than a video has: frames=3"):
-        module(tmp_path, short_clips={"frames": 4, "batch_size": 3, "steps": 2})
-
-
 def test_the_order_depends_on_the_seed_of_the_run(made: Path, ready: P2DModule):
     def order(seed: int) -> list[int]:
         data = module(made, seed=seed)
@@ -248,17 +231,7 @@ def test_the_shipped_configuration_is_the_default_data_set():
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"short_clips": {"frames": 2}},
-        {"short_clips": {"frames": 0, "batch_size": 1, "steps": 1}},
-        {"short_clips": 2},
-        {"frames": "8"},
-        {"train": 0},
-        {"batchsize": 2},
-        {"verify": "sometimes"},
-        {"generate": 1},
-        {"image_size": 8},
-    ],
+    [{"frames": "8"}, {"train": 0}, {"batchsize": 2}, {"verify": "sometimes"}, {"generate": 1}, {"image_size": 8}],
 )
 def test_wrong_values_in_a_configuration_are_refused(change: dict[str, Any]):
     with pytest.raises(UserError, match=f"data.{next(iter(change))}"):

@@ -15,7 +15,6 @@ import torch
 from torch.utils.data import DataLoader
 
 from apex_lab.data import P2D
-from apex_lab.data.batches import Clip
 from apex_lab.data.bench import frames_per_second
 from apex_lab.errors import UserError
 from sims.p2d.manifest import MANIFEST
@@ -62,22 +61,6 @@ def test_a_part_of_the_frames(root: Path):
     torch.testing.assert_close(part["segmentation"], whole["segmentation"][3:5])
     np.testing.assert_array_equal(P2D(root, "val", 2, 3).meta(1)["depth"], P2D(root, "val").meta(1)["depth"][3:5])
     assert P2D(root, "val", frames=2).meta(1)["classes"].shape == (3,)
-
-
-def test_a_clip_is_a_stretch_of_one_video(root: Path):
-    whole, part = P2D(root, "val"), P2D(root, "val", frames=3, start=2)
-    index = len(whole) - 1
-    clip = whole[Clip(index, 1, 2)]
-    torch.testing.assert_close(clip["video"], whole[index]["video"][1:3])
-    torch.testing.assert_close(clip["segmentation"], whole[index]["segmentation"][1:3])
-    assert clip["index"] == index
-    torch.testing.assert_close(part[Clip(index, 1, 2)]["video"], whole[index]["video"][3:5])
-
-
-@pytest.mark.parametrize("clip", [Clip(0, 0, 6), Clip(0, 4, 2), Clip(0, -1, 2), Clip(0, 0, 0), Clip(99, 0, 1)])
-def test_a_clip_outside_of_its_video_is_an_index_error(root: Path, clip: Clip):
-    with pytest.raises(IndexError, match="of split val"):
-        P2D(root, "val")[clip]
 
 
 @pytest.mark.parametrize(("frames", "start"), [(6, 0), (2, 4), (0, 0), (1, -1), (None, 5)])

@@ -21,9 +21,7 @@ FOREVER = 10**9
 
 def frames_per_second(data: P2D, batch_size: int, workers: int, seconds: float) -> float:
     """Frames per second of whole shuffled batches, as training takes them, measured after two batches of warm-up."""
-    batches = TrainBatches(
-        len(data), data.clip.stop - data.clip.start, batch_size, seed=0, start_step=0, max_steps=FOREVER
-    )
+    batches = TrainBatches(len(data), batch_size, seed=0, start_step=0, max_steps=FOREVER)
     source = iter(DataLoader(data, batch_sampler=batches, num_workers=workers))
     frames = 0
     for _ in range(2 + 2 * workers):  # what the workers have loaded ahead must not count

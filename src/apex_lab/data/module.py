@@ -13,7 +13,7 @@ from pydantic import Field, ValidationError
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
-from apex_lab.data.batches import ShortClips, TrainBatches
+from apex_lab.data.batches import TrainBatches
 from apex_lab.data.p2d import P2D
 from apex_lab.errors import UserError
 from sims.errors import SimError
@@ -47,7 +47,6 @@ class P2DModule(LightningDataModule):
         simulation: further settings of the simulation (`sims.p2d.settings.Settings`), for example max_objects.
         batch_size: videos per training step.
         eval_batch_size: videos per validation and test step; None: as `batch_size`.
-        short_clips: what the first training steps see instead of whole videos; None: whole videos from the start.
         workers: processes that load data; 0 loads in the training process.
         generate: make missing data; False: refuse.
         sim_workers: processes that make data; None: one per core.
@@ -71,7 +70,6 @@ class P2DModule(LightningDataModule):
         simulation: dict[str, Any] | None = None,
         batch_size: Annotated[int, Field(gt=0)] = 4,
         eval_batch_size: Annotated[int, Field(gt=0)] | None = None,
-        short_clips: ShortClips | None = None,
         workers: Annotated[int, Field(ge=0)] = 2,
         generate: bool = True,
         sim_workers: Annotated[int, Field(gt=0)] | None = None,
@@ -82,9 +80,6 @@ class P2DModule(LightningDataModule):
         self.settings = _settings({"seed": data_seed, **sizes}, simulation or {})
         self.seed, self.workers = seed, workers
         self.batch_size, self.eval_batch_size = batch_size, eval_batch_size or batch_size
-        if short_clips is not None and short_clips["frames"] > frames:
-            raise UserError(f"short_clips.frames={short_clips['frames']} is more than a video has: frames={frames}")
-        self.short_clips = short_clips
         self.generate, self.sim_workers, self.verify = generate, sim_workers, verify
         name = f"p2d_{image_size}px_{frames}f_{fingerprint(self.settings)[:8]}"
         self.folder = Path(root).expanduser().absolute() / name
@@ -129,15 +124,7 @@ class P2DModule(LightningDataModule):
         """Batches of the steps from `start_step` up to `max_steps`, in a row without epochs."""
         if self.max_steps is None:
             raise UserError("P2DModule.max_steps is not set: set it to the number of training steps before training")
-        batches = TrainBatches(
-            self.settings.train,
-            self.settings.frames,
-            self.batch_size,
-            self.seed,
-            self.start_step,
-            self.max_steps,
-            self.short_clips,
-        )
+        batches = TrainBatches(self.settings.train, self.batch_size, self.seed, self.start_step, self.max_steps)
         return DataLoader(self.sets["train"], batch_sampler=batches, **self._options())
 
     def val_dataloader(self) -> Loader:

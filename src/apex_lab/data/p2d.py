@@ -22,7 +22,6 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from apex_lab.data.batches import Clip
 from apex_lab.errors import UserError
 from sims.errors import SimError
 from sims.p2d.store import FIELDS, SPLITS, array_path
@@ -66,18 +65,10 @@ class P2D(Dataset[dict[str, Any]]):
     def __len__(self) -> int:
         return int(getattr(self.manifest.settings, self.split))
 
-    def __getitem__(self, index: int | Clip) -> dict[str, Any]:
-        """A video by its number, or a stretch of one, counted from the set's first frame."""
-        clip = self.clip
-        if isinstance(index, Clip):
-            start = clip.start + index.start
-            if not clip.start <= start < start + index.frames <= clip.stop:
-                raise IndexError(f"{index} of split {self.split}, whose videos have {clip.stop - clip.start} frames")
-            clip = slice(start, start + index.frames)
-            index = index.video
+    def __getitem__(self, index: int) -> dict[str, Any]:
         position = self._position(index)
-        video = self._array("rgb")[position, clip].transpose(0, 3, 1, 2)
-        segmentation = self._array("segmentation")[position, clip]
+        video = self._array("rgb")[position, self.clip].transpose(0, 3, 1, 2)
+        segmentation = self._array("segmentation")[position, self.clip]
         return {
             "video": torch.from_numpy(np.array(video, order="C")),
             "segmentation": torch.from_numpy(np.array(segmentation)),
