@@ -83,6 +83,9 @@ def test_accepts_and_builds(values: dict[str, Any]) -> None:
         ({"part": {"_target_": f"{HERE}.HERE"}}, r"is not a class or function\.$"),
         ({"part": {"_target_": 3}}, r"^model\.part\._target_ = 3 is not the name of a class"),
         ({"part": 3}, r"^model\.part = 3 is wrong"),
+        ({"part": node()}, r"^model\.part: .*Whole cannot stand here, where Part is asked for\.$"),
+        ({"parts": node()["part"]}, r"^model\.parts: .*Part cannot stand here, where list or nothing is asked for\.$"),
+        ({"named": node()["part"]}, r"^model\.named: .*Part cannot stand here, where dict or nothing is asked for\.$"),
     ],
 )
 def test_refuses_in_one_sentence(values: dict[str, Any], told: str) -> None:

@@ -71,6 +71,7 @@ def check(node: Node, key: str, supplied: Iterable[str] = ()) -> None:
             raise UserError(sentence(f"Unknown key {key}.{name} = {shown(value)}{did_you_mean(name, parameters)}"))
         _check_nested(value, f"{key}.{name}")
         if _holds_nodes(value) and name in parameters:
+            _check_built(value, parameters[name][0], f"{key}.{name}")
             parameters[name] = (Any, ...)
     # pydantic minds some names of fields (`model_...`, `schema`) that are fine for parameters
     fields = {name: f"field_{i}" for i, name in enumerate(parameters)}
@@ -138,6 +139,31 @@ def _hints(target: Callable[..., Any]) -> dict[str, Any]:
         except NameError:
             continue
     return hints
+
+
+def _check_built(value: Any, hint: Any, key: str) -> None:
+    """Whether what a nested component builds is what its place asks for, as far as both are classes."""
+    if not is_node(value):
+        return
+    built = target_of(value, key)
+    wanted = _classes(hint)
+    if inspect.isclass(built) and wanted and not issubclass(built, wanted):
+        names = " or ".join("nothing" if one is type(None) else one.__name__ for one in wanted)
+        raise UserError(f"{key}: {value['_target_']} cannot stand here, where {names} is asked for.")
+
+
+def _classes(hint: Any) -> tuple[type, ...]:
+    """Classes that a type hint allows; empty where it allows what no class tells, such as Any or a protocol."""
+    origin = typing.get_origin(hint)
+    if origin is typing.Annotated:
+        return _classes(typing.get_args(hint)[0])
+    if origin in (typing.Union, types.UnionType):
+        parts = [_classes(part) for part in typing.get_args(hint)]
+        return tuple(one for part in parts for one in part) if all(parts) else ()
+    plain = hint if origin is None else origin
+    if not inspect.isclass(plain) or getattr(plain, "_is_protocol", False):
+        return ()
+    return (plain,)
 
 
 def _holds_nodes(value: object) -> bool:
