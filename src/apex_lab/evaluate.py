@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from apex_lab import cli, config, console
 from apex_lab.errors import UserError
-from apex_lab.evaluation import Export, ScoringPart
+from apex_lab.evaluation import OF_SCENES, Export, ScoringPart
 from apex_lab.evaluation.checkpoint import Request, evaluate_checkpoint, find, load
 from apex_lab.evaluation.others import Predictions, check_output, output_of, score_others
 from apex_lab.metrics import KEYS
@@ -102,7 +102,11 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
     if not files:
         raise UserError("checkpoint = [] names no file: give a .ckpt file or a run folder.")
     for file in files:
-        load(file, asked.paths)
+        _, job = load(file, asked.paths)
+        if asked.scoring.masks == "posterior" and not config.build_model(job.config).has_posterior:
+            raise UserError(
+                f"scoring.masks = posterior needs a mixture likelihood, which {file} has none of: leave it out."
+            )
     return Evaluation(asked, files=tuple(files))
 
 
@@ -160,9 +164,9 @@ def _predictions(asked: EvaluateConfig) -> Predictions:
     path, scoring, usual = Path(asked.predictions), asked.scoring, ScoringPart()
     if not path.exists():
         raise UserError(f"predictions = {path} does not exist: give an .npz or .json file, or a folder.")
-    for key in ("min_presence", "presence_after"):
+    for key in OF_SCENES:
         if getattr(scoring, key) != getattr(usual, key):
-            raise UserError(f"scoring.{key} has no effect on predictions, which hold no presence: leave it out.")
+            raise UserError(f"scoring.{key} has no effect on predictions, which hold identities alone: leave it out.")
     if scoring.tracking.drop_background_slot:
         raise UserError(
             "scoring.tracking.drop_background_slot has no effect on predictions, which do not say what is background: "

@@ -80,6 +80,9 @@ class SceneModel(nn.Module):
     needs_labels: bool = False
     """True for models that read the ground truth (the oracle): `from_labels` takes the place of `forward`."""
 
+    has_posterior: bool = False
+    """True for models whose likelihood is a mixture over components, so that `posterior` can be asked."""
+
     def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
         """Called once before training starts from scratch, with the training set's per-pixel median in [0, 1].
 
@@ -89,6 +92,21 @@ class SceneModel(nn.Module):
     def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
         """RGB video in [0, 1] and the scheduled values at this step -> `Scene`."""
         raise TypeError(f"{type(self).__name__} does not define forward(video, schedule)")
+
+    def posterior(
+        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], schedule: Schedule
+    ) -> Float[Tensor, "B T K H W"]:
+        """How likely each component is to have drawn each pixel, given the pixel; sums to 1 over K.
+
+        `Scene.masks` are the mixing weights before the pixel is seen; these are the weights after (its
+        responsibilities).
+
+        Args:
+            scene: of this video, from this model in evaluation mode.
+            video: RGB in [0, 1].
+            schedule: as it was for the scene.
+        """
+        raise TypeError(f"{type(self).__name__} has no mixture likelihood, so no posterior over components")
 
     def from_labels(self, video: Float[Tensor, "B T 3 H W"], segmentation: Integer[Tensor, "B T H W"]) -> Scene:
         """RGB video in [0, 1] and its ground truth -> `Scene`; called in place of `forward` where `needs_labels`."""

@@ -298,3 +298,24 @@ def test_impossible_wishes_are_refused_in_a_sentence(
     assert ended.code == 2
     assert told in ended.err
     assert len(ended.err.splitlines()) == 1
+
+
+def test_a_posterior_is_asked_of_models_that_have_one_alone(
+    make_run: Make, ask: Ask, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run()
+    ended = ask(f"checkpoint={run}", "scoring.masks=posterior")
+    assert ended.code == 2
+    told = f"scoring.masks = posterior needs a mixture likelihood, which {run}/checkpoints/last.ckpt has none of"
+    assert told in ended.err
+    assert not (run / "evaluate").exists()
+    monkeypatch.setattr(Layers, "has_posterior", True)
+    monkeypatch.setattr(Layers, "posterior", lambda self, scene, video, schedule: scene.masks.flip(2))
+    assert ask(f"checkpoint={run}", "pictures=0").code == 0
+    assert ask(f"checkpoint={run}", "pictures=0", "scoring.masks=posterior").code == 0
+    (folder,) = (run / "evaluate").glob("last_test_*")
+    found = stored(folder)["splits"]["test"]
+    assert found["settings"]["scoring"]["masks"] == "posterior"
+    assert stored(run)["splits"]["test"]["settings"]["scoring"]["masks"] == "model"
+    assert found["total"]["ari"] == pytest.approx(scores(run)["total"]["ari"])  # a flip renames components
+    assert found["foreground_share"] != scores(run)["foreground_share"]  # but another one is the background

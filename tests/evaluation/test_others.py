@@ -93,6 +93,7 @@ def test_impossible_wishes_are_refused_in_a_sentence(public: Path, ask: Ask) -> 
         ("output=.",): "output = . is a folder: give the name of a file.",
         ("output=./public.npz",): "output = public.npz would overwrite what is scored",
         ("truth=truth.npz", "output=truth.npz"): "output = truth.npz would overwrite what is scored",
+        ("scoring.masks=posterior",): "scoring.masks has no effect on predictions",
         ("scoring.min_presence=0.1",): "scoring.min_presence has no effect on predictions",
         ("scoring.tracking.drop_background_slot=true",): "drop_background_slot has no effect on predictions",
     }.items():

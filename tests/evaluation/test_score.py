@@ -148,3 +148,23 @@ def test_the_file_s_scoring_is_that_of_training() -> None:
 def test_the_page_of_keys_is_current() -> None:
     told = "run `python -m apex_lab.metrics.page > docs/metrics.md`"
     assert (REPOSITORY / "docs" / "metrics.md").read_text() == page(), told
+
+
+class Mixture(Layers):
+    """Its posterior shifts components by one."""
+
+    has_posterior = True
+
+    def posterior(
+        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], schedule: Schedule
+    ) -> Float[Tensor, "B T K H W"]:
+        return scene.masks.roll(1, dims=2)
+
+
+def test_a_posterior_takes_the_place_of_the_masks_and_changes_nothing_else() -> None:
+    batch = next(iter(DataLoader(Squares(2, 3, 32, 0), batch_size=2)))
+    model = Mixture()
+    plain, shifted = (Predictor(model, {}, CPU, posterior=posterior)(batch) for posterior in (False, True))
+    torch.testing.assert_close(shifted.masks, plain.masks.roll(1, dims=2))
+    torch.testing.assert_close(shifted.reconstruction, plain.reconstruction)
+    assert (shifted.segmentation() == (plain.segmentation() + 1) % 3).all()

@@ -106,6 +106,11 @@ def test_settings_and_data_of_the_split_come_before_those_of_the_file(tmp_path: 
         folder, "metrics.json", ("splits", "test", "settings"), {"scoring": {"first_frame": 0, "identities": "none"}}
     )
     assert only(tmp_path).protocol == before
+    said = {"first_frame": 0, "masks": "model"}  # earlier versions did not say which masks
+    change(folder, "metrics.json", ("splits", "test", "settings"), {"scoring": said})
+    assert only(tmp_path).protocol == before
+    change(folder, "metrics.json", ("splits", "test", "settings"), {"scoring": {**said, "masks": "posterior"}})
+    assert only(tmp_path).protocol != before
     change(folder, "metrics.json", ("splits", "test", "settings"), {"scoring": {"first_frame": 2}})
     change(folder, "metrics.json", ("splits", "test", "data_fingerprint"), "e" * 32)
     after = only(tmp_path).protocol

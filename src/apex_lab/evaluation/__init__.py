@@ -7,12 +7,13 @@ from apex_lab.evaluation.parts import Parts, Tally
 from apex_lab.evaluation.pictures import PICTURES_BY
 from apex_lab.evaluation.record import COLUMNS, TRACKING_COLUMNS, summary
 from apex_lab.evaluation.score import Predictor, score
-from apex_lab.evaluation.scoring import ScoringPart
+from apex_lab.evaluation.scoring import OF_SCENES, ScoringPart
 from apex_lab.evaluation.whole import Asked, evaluate
 
 __all__ = [
     "COLUMNS",
     "EXPORTS",
+    "OF_SCENES",
     "PICTURES_BY",
     "TRACKING_COLUMNS",
     "Asked",

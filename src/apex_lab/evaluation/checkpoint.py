@@ -147,7 +147,8 @@ def _evaluate(
         curves=run_folder(file) / "curves.csv",
         export=request.export,
     )
-    predictor = Predictor(model, schedule, device, job.config.trainer.precision)
+    posterior = request.scoring.masks == "posterior"
+    predictor = Predictor(model, schedule, device, job.config.trainer.precision, posterior)
     scored, paths = evaluate(asked, predictor, data.loader(request.split, request.videos), parts)
     _show(request.split, scored, [folder / "metrics.json", *paths])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -29,10 +30,18 @@ class Predictor:
         schedule: values the model is called with, on `device`.
         device: where the model runs.
         precision: 32 or "bf16-mixed".
+        posterior: scenes come with `SceneModel.posterior` as their masks.
     """
 
-    def __init__(self, model: SceneModel, schedule: Schedule, device: torch.device, precision: int | str = 32) -> None:
-        self.model = model.to(device).eval()
+    def __init__(
+        self,
+        model: SceneModel,
+        schedule: Schedule,
+        device: torch.device,
+        precision: int | str = 32,
+        posterior: bool = False,
+    ) -> None:
+        self.model, self.posterior = model.to(device).eval(), posterior
         self.schedule, self.device, self.precision = schedule, device, precision
 
     @torch.no_grad()
@@ -42,7 +51,10 @@ class Predictor:
         if self.model.needs_labels:
             return self.model.from_labels(video, batch["segmentation"].to(self.device).long())
         with torch.autocast(video.device.type, dtype=torch.bfloat16, enabled=self.precision == "bf16-mixed"):
-            return self.model(video, self.schedule)
+            scene = self.model(video, self.schedule)
+        if not self.posterior:
+            return scene
+        return dataclasses.replace(scene, masks=self.model.posterior(scene, video, self.schedule))
 
 
 def score(

@@ -10,6 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from apex_lab.metrics import EvaluatorSettings, TrackingSettings
 from apex_lab.metrics.boundary import TOLERANCE
 
+OF_SCENES = ("min_presence", "presence_after", "masks")
+"""Keys that say how a `Scene` becomes identities; files of predictions hold identities."""
+
 
 class _Part(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
@@ -40,6 +43,7 @@ class ScoringPart(_Part):
         identities: `own`, `none` and `linked` as there; `auto` is `own` for a model that tracks (`SceneModel.tracks`)
             and for files of predictions, else `none`.
         min_presence, presence_after: as in `apex_lab.metrics.scene_identities`.
+        masks: `model` scores `Scene.masks`, as the paper does; `posterior` scores `SceneModel.posterior`.
     """
 
     tracking: TrackingPart = TrackingPart()
@@ -49,6 +53,7 @@ class ScoringPart(_Part):
     identities: Literal["auto", "own", "none", "linked"] = "auto"
     min_presence: float = Field(default=0.5, ge=0, le=1)
     presence_after: bool = False
+    masks: Literal["model", "posterior"] = "model"
 
     @model_validator(mode="after")
     def _possible(self) -> ScoringPart:
@@ -74,5 +79,5 @@ class ScoringPart(_Part):
 
     def stored(self, tracks: bool) -> dict[str, Any]:
         """What is stored with the results."""
-        presence = {"min_presence": self.min_presence, "presence_after": self.presence_after}
-        return {**asdict(self.settings(tracks)), **presence}
+        of_scenes = {name: getattr(self, name) for name in OF_SCENES}
+        return {**asdict(self.settings(tracks)), **of_scenes}

@@ -239,6 +239,8 @@ def _scoring(scored: Mapping[str, Any], content: Mapping[str, Any]) -> str:
     scoring = settings.get("scoring") if isinstance(settings, dict) else None
     if isinstance(scoring, dict) and scoring.get("identities") in ("own", "none"):
         scoring = {key: value for key, value in scoring.items() if key != "identities"}
+    if isinstance(scoring, dict) and scoring.get("masks") == "model":  # what earlier versions did without saying so
+        scoring = {key: value for key, value in scoring.items() if key != "masks"}
     return json.dumps(scoring, sort_keys=True)
 
 

@@ -143,3 +143,57 @@ def test_no_gradient_goes_to_the_scales(likelihood: Likelihood) -> None:
     likelihood(*inputs, *scales).sum().backward()
     assert means.grad is not None
     assert all(scale.grad is None for scale in scales)
+
+
+def whole_case(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
+    """`case` with the background as the last component, as `responsibilities` takes it."""
+    image, log_objects, means, log_background, background = case(dtype)
+    masks = torch.cat([log_objects, log_background[:, None]], 1).exp()
+    return image, masks, torch.cat([means, background[:, None]], 1), torch.arange(4) == 3
+
+
+@pytest.mark.parametrize("over", ["channel", "pixel"])
+def test_responsibilities_against_bayes_rule_pixel_by_pixel(over: str) -> None:
+    image, masks, means, background = whole_case()
+    likelihood = MixtureLikelihood(0.4, 0.2, over)  # type: ignore[arg-type]
+    got = likelihood.responsibilities(image, masks, means, background)
+    for n in range(2):
+        for y in range(4):
+            for x in range(5):
+                p = [
+                    [
+                        density(image[n, c, y, x].item(), means[n, k, c, y, x].item(), 0.2 if k == 3 else 0.4)
+                        for c in range(3)
+                    ]
+                    for k in range(4)
+                ]
+                m = masks[n, :, y, x].tolist()
+                if over == "pixel":
+                    joint = [m[k] * math.prod(p[k]) for k in range(4)]
+                    want = [one / sum(joint) for one in joint]
+                else:
+                    evidence = [sum(m[k] * p[k][c] for k in range(4)) for c in range(3)]
+                    want = [sum(m[k] * p[k][c] / evidence[c] for c in range(3)) / 3 for k in range(4)]
+                assert got[n, :, y, x].tolist() == pytest.approx(want, rel=1e-9, abs=1e-300)
+    assert (got[:, 1] == 0).all()  # an absent component's
+
+
+@pytest.mark.parametrize(("over", "values"), [("channel", 3), ("pixel", 1)])
+@pytest.mark.parametrize("scales", [(), (torch.tensor(2.5), torch.tensor(0.75))])
+def test_responsibilities_are_what_the_likelihood_gains_by_a_larger_mask(
+    over: str, values: int, scales: tuple[torch.Tensor, ...]
+) -> None:
+    image, log_objects, means, log_background, background = case()
+    leaves = [log_objects.requires_grad_(), log_background.requires_grad_()]
+    likelihood = MixtureLikelihood(0.3, 0.1, over)  # type: ignore[arg-type]
+    out = likelihood(image, leaves[0], means, leaves[1], background, *scales).sum()
+    objects, back = torch.autograd.grad(out, leaves)
+    gains = torch.cat([objects, back[:, None]], 1) / values
+    torch.testing.assert_close(likelihood.responsibilities(*whole_case(), *scales), gains)
+
+
+def test_responsibilities_far_from_every_mean_still_sum_to_one() -> None:
+    image, masks, means, background = whole_case(torch.float32)
+    for likelihood in (MixtureLikelihood(), MixtureLikelihood(0.1, 0.04, "pixel")):
+        found = likelihood.responsibilities(image + 50, masks, means, background)
+        torch.testing.assert_close(found.sum(1), torch.ones(2, 4, 5))

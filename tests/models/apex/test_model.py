@@ -230,3 +230,27 @@ def test_the_scales_of_the_sigmas_widen_those_of_the_whole_model(fg: float, bg: 
     for name, value in wide.items():
         torch.testing.assert_close(scaled[name], value, rtol=1e-5, atol=1e-3)
     assert not torch.allclose(scaled["nll"], narrow["nll"])
+
+
+def test_the_posterior_is_bayes_rule_on_what_the_scene_shows() -> None:
+    model = tiny().eval()
+    scene = model(video(), SCHEDULE)
+    found = model.posterior(scene, video(), {**SCHEDULE, "sigma_bg_scale": torch.tensor(2.0)})
+    assert model.has_posterior
+    assert scene.means is not None
+    sigma = torch.where(scene.background, 0.08, 0.1)[:, None, None, None]
+    density = torch.distributions.Normal(scene.means, sigma).log_prob(video()[:, :, None]).double().exp()
+    joint = scene.masks[:, :, :, None].double() * density
+    torch.testing.assert_close(found.double(), (joint / joint.sum(2, keepdim=True)).mean(3), atol=1e-5, rtol=1e-4)
+    assert (found[scene.masks == 0] == 0).all()
+    assert not torch.allclose(found, scene.masks, atol=0.01)
+
+
+def test_a_posterior_is_refused_in_training_and_under_one_gaussian() -> None:
+    model = tiny()
+    with pytest.raises(ValueError, match="evaluation mode"):
+        model.posterior(model(video(), SCHEDULE), video(), SCHEDULE)
+    model = tiny(likelihood=GaussianLikelihood()).eval()
+    assert not model.has_posterior
+    with pytest.raises(TypeError, match="Apex has no mixture likelihood"):
+        model.posterior(model(video(), SCHEDULE), video(), SCHEDULE)

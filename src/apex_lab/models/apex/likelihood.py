@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
@@ -132,6 +132,34 @@ class MixtureLikelihood(Likelihood):
         # One sum over all components: over the objects alone it has no gradient where all their masks are zero.
         parts = torch.cat([by_object + log_objects, (by_background + log_background)[:, None]], dim=1)
         return torch.logsumexp(parts, dim=1).flatten(1).sum(1)
+
+    def responsibilities(
+        self,
+        image: Float[Tensor, "N 3 H W"],
+        masks: Float[Tensor, "N K H W"],
+        means: Float[Tensor, "N K 3 H W"],
+        background: Bool[Tensor, "K"],
+        scale_fg: Float[Tensor, ""] | None = None,
+        scale_bg: Float[Tensor, ""] | None = None,
+    ) -> Float[Tensor, "N K H W"]:
+        """p(component | pixel), the posterior under Eq. 1: m_k N(x; mu_k, sigma_k^2) over its sum over components.
+
+        Where channels are mixed each by itself, a pixel has one posterior per channel: their mean is returned.
+
+        Args:
+            image: RGB in [0, 1].
+            masks: of all components, sum to 1 over K.
+            means: their pictures, RGB in [0, 1].
+            background: which components have the background's standard deviation.
+            scale_fg, scale_bg: as in `__call__`.
+        """
+        sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
+        sigma = torch.where(background, sigma_bg, sigma_fg)[:, None, None, None]
+        each = log_normal(image[:, None], means, sigma)
+        log_masks = masks.log()[:, :, None]
+        if self.mixture_over == "pixel":
+            return (log_masks + each.sum(2, keepdim=True)).softmax(1).squeeze(2)
+        return (log_masks + each).softmax(1).mean(2)
 
 
 class GaussianLikelihood(Likelihood):

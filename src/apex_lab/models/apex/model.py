@@ -12,7 +12,7 @@ from torch import Tensor
 from apex_lab.models.apex.background import Background
 from apex_lab.models.apex.encoder import ApexEncoder
 from apex_lab.models.apex.glimpses import Glimpses
-from apex_lab.models.apex.likelihood import Likelihood
+from apex_lab.models.apex.likelihood import Likelihood, MixtureLikelihood
 from apex_lab.models.apex.masks import MaskNormalisation, Masks
 from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, mask_entropy
 from apex_lab.models.apex.objects import (
@@ -117,6 +117,7 @@ class Apex(SceneModel):
             )
         self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
         self.render_top = min(render_top or grid**2, grid**2)
+        self.has_posterior = isinstance(likelihood, MixtureLikelihood)
         self.direction, self.keep_threshold = kl, keep_threshold
         self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
         self.encoder, self.glimpses, self.background = encoder, glimpses, background
@@ -156,6 +157,24 @@ class Apex(SceneModel):
         proposals = self.discovery(features, look_at, self.glimpses, self.appearance, self.training)
         steps = self._roll_out(look_at, follow_in, proposals, schedule)
         return self._explain(video, proposals, steps, schedule)
+
+    def posterior(
+        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], schedule: Schedule
+    ) -> Float[Tensor, "B T K H W"]:
+        """Responsibilities of the objects carried on and the background under Eq. 1; see `SceneModel.posterior`."""
+        if not isinstance(self.likelihood, MixtureLikelihood):
+            return super().posterior(scene, video, schedule)
+        if scene.means is None:
+            raise ValueError("the scene has no means: posterior is for scenes of a model in evaluation mode")
+        found = self.likelihood.responsibilities(
+            video.flatten(0, 1),
+            scene.masks.flatten(0, 1).float(),
+            scene.means.flatten(0, 1).float(),
+            scene.background,
+            schedule["sigma_fg_scale"],
+            schedule["sigma_bg_scale"],
+        )
+        return found.unflatten(0, video.shape[:2])
 
     def _alpha(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch g g"]:
         raw = self.mask_decoder(what.reshape(-1, what.shape[-1]))
