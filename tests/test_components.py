@@ -1,10 +1,14 @@
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, SupportsFloat, TypedDict
 
 import pytest
+from jaxtyping import Float
 from pydantic import Field
+from torch import Tensor
 
 from apex_lab.components import build, check
 from apex_lab.errors import UserError
@@ -92,6 +96,40 @@ def test_refuses_in_one_sentence(values: dict[str, Any], told: str) -> None:
     with pytest.raises(UserError, match=told) as refusal:
         check(node(**values), "model")
     assert "\n" not in str(refusal.value)
+
+
+class Fields(TypedDict):
+    size: int
+
+
+class Loose:
+    """Hints that no class tells."""
+
+    def __init__(
+        self,
+        unhinted,  # type: ignore[no-untyped-def]
+        anything: Any,
+        maybe: Any | None,
+        unknown: "NoSuchName",  # type: ignore[name-defined]
+        called: Callable[[int], int],
+        several: Sequence[Part],
+        array: Float[Tensor, "3"],
+        typed: Fields,
+        sized: SupportsFloat,
+    ) -> None:
+        self.given = (unhinted, anything, maybe, unknown, called, several, array, typed, sized)
+
+
+def test_what_no_class_tells_takes_any_component() -> None:
+    names = list(inspect.signature(Loose).parameters)
+    loose = {"_target_": f"{HERE}.Loose", **{name: node()["part"] for name in names}}
+    check(loose, "model")
+    assert build(loose, "model").given == (Part(2),) * len(names)
+
+
+def test_a_class_without_a_signature_is_refused() -> None:
+    with pytest.raises(UserError, match=r"^model\._target_ cannot be used: no signature found"):
+        check({"_target_": "builtins.dict"}, "model")
 
 
 def test_a_constructor_s_own_check_is_told() -> None:

@@ -92,3 +92,8 @@ def test_nothing_to_look_at_is_refused(words: tuple[str, ...], told: str) -> Non
     with pytest.raises(UserError, match=told):
         compose_job("data=p2d", *words)
     assert compose_job("data=p2d", "data.val=0", "trainer.validation_interval=null").config.data["val"] == 0
+
+
+def test_what_gives_no_number_for_a_step_is_no_schedule() -> None:
+    with pytest.raises(UserError, match=r"^lr_scale is not a schedule, which gives a number for a step: "):
+        compose_job("lr_scale={_target_: torch.nn.Linear, in_features: 1, out_features: 1}")

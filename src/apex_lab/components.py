@@ -11,6 +11,7 @@ import inspect
 import pkgutil
 import types
 import typing
+from abc import ABCMeta
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -50,7 +51,7 @@ def target_of(node: Node, key: str) -> Callable[..., Any]:
 
 def takes(node: Node, key: str, parameter: str) -> bool:
     """Whether what a node builds has a parameter of that name."""
-    return parameter in inspect.signature(target_of(node, key)).parameters
+    return parameter in _signature(target_of(node, key), key).parameters
 
 
 def check(node: Node, key: str, supplied: Iterable[str] = ()) -> None:
@@ -64,7 +65,7 @@ def check(node: Node, key: str, supplied: Iterable[str] = ()) -> None:
     Raises:
         UserError: unknown key, missing key, wrong type or value out of bounds; one sentence.
     """
-    parameters, open_ended = _parameters(target_of(node, key), set(supplied))
+    parameters, open_ended = _parameters(target_of(node, key), key, set(supplied))
     values = {name: value for name, value in node.items() if name != "_target_"}
     for name, value in values.items():
         if name not in parameters and (name in supplied or not open_ended):
@@ -110,12 +111,19 @@ def _build_inside(value: Any, key: str) -> Any:
     return value
 
 
-def _parameters(target: Callable[..., Any], supplied: set[str]) -> tuple[dict[str, Any], bool]:
+def _signature(target: Callable[..., Any], key: str) -> inspect.Signature:
+    try:
+        return inspect.signature(target)
+    except ValueError as error:  # some built-in classes
+        raise UserError(sentence(f"{key}._target_ cannot be used: {one_line(error)}")) from error
+
+
+def _parameters(target: Callable[..., Any], key: str, supplied: set[str]) -> tuple[dict[str, Any], bool]:
     """Parameter name -> (type, default or ...) as pydantic wants it, and whether further keywords are taken."""
     hints = _hints(target)
     parameters: dict[str, Any] = {}
     open_ended = False
-    for name, parameter in inspect.signature(target).parameters.items():
+    for name, parameter in _signature(target, key).parameters.items():
         if parameter.kind is parameter.VAR_KEYWORD:
             open_ended = True
         elif parameter.kind is not parameter.VAR_POSITIONAL and name not in supplied:
@@ -153,7 +161,11 @@ def _check_built(value: Any, hint: Any, key: str) -> None:
 
 
 def _classes(hint: Any) -> tuple[type, ...]:
-    """Classes that a type hint allows; empty where it allows what no class tells, such as Any or a protocol."""
+    """Classes that a type hint allows; empty where it allows what no class tells.
+
+    Any, protocols, typed dictionaries, array types and the abstract collections have metaclasses or registries of their
+    own: what satisfies them need not be a subclass.
+    """
     origin = typing.get_origin(hint)
     if origin is typing.Annotated:
         return _classes(typing.get_args(hint)[0])
@@ -161,7 +173,7 @@ def _classes(hint: Any) -> tuple[type, ...]:
         parts = [_classes(part) for part in typing.get_args(hint)]
         return tuple(one for part in parts for one in part) if all(parts) else ()
     plain = hint if origin is None else origin
-    if not inspect.isclass(plain) or getattr(plain, "_is_protocol", False):
+    if type(plain) not in (type, ABCMeta) or plain.__module__ == "collections.abc":
         return ()
     return (plain,)
 

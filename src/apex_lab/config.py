@@ -19,7 +19,7 @@ from apex_lab.errors import UserError
 from apex_lab.metrics.modules import PAPER_SCORES
 from apex_lab.scene import SceneModel
 from apex_lab.schedules import Constant
-from apex_lab.validation import did_you_mean, sentence, shown, validate
+from apex_lab.validation import did_you_mean, one_line, sentence, shown, validate
 
 
 def conf_dir() -> Path:
@@ -287,7 +287,12 @@ def _check_range(key: str, schedule: Callable[[int], float], limits: tuple[float
     """A schedule must stay within its limits at every step that a run makes; looked at in at most some 1,000 steps."""
     low, high = limits
     for step in [*range(0, last, max(1, last // 1000)), last]:
-        value = schedule(step)
+        try:
+            value = float(schedule(step))
+        except (TypeError, ValueError, AttributeError) as error:
+            raise UserError(
+                sentence(f"{key} is not a schedule, which gives a number for a step: {one_line(error)}")
+            ) from error
         if not low <= value <= high:
             reach = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
             raise UserError(f"{key} is {value:g} at step {step}: it must be {reach}.")

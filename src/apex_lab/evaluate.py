@@ -101,11 +101,12 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
     files = find([asked.checkpoint] if isinstance(asked.checkpoint, str) else asked.checkpoint or [])
     if not files:
         raise UserError("checkpoint = [] names no file: give a .ckpt file or a run folder.")
-    for file in files:
-        _, job = load(file, asked.paths)
-        if asked.scoring.masks == "posterior" and not config.build_model(job.config).has_posterior:
+    jobs = {file: load(file, asked.paths)[1] for file in files}
+    if asked.scoring.masks == "posterior":
+        without = [str(file) for file, job in jobs.items() if not config.build_model(job.config).has_posterior]
+        if without:
             raise UserError(
-                f"scoring.masks = posterior needs a mixture likelihood, which {file} has none of: leave it out."
+                f"scoring.masks = posterior goes with mixture likelihoods alone: leave out {', '.join(without)}."
             )
     return Evaluation(asked, files=tuple(files))
 

@@ -306,8 +306,8 @@ def test_a_posterior_is_asked_of_models_that_have_one_alone(
     run = make_run()
     ended = ask(f"checkpoint={run}", "scoring.masks=posterior")
     assert ended.code == 2
-    told = f"scoring.masks = posterior needs a mixture likelihood, which {run}/checkpoints/last.ckpt has none of"
-    assert told in ended.err
+    files = f"{run}/checkpoints/last.ckpt"
+    assert f"scoring.masks = posterior goes with mixture likelihoods alone: leave out {files}." in ended.err
     assert not (run / "evaluate").exists()
     monkeypatch.setattr(Layers, "has_posterior", True)
     monkeypatch.setattr(Layers, "posterior", lambda self, scene, video, schedule: scene.masks.flip(2))

@@ -193,7 +193,7 @@ def _folder(
         return run
     words = [file.stem if in_run and ended else of_file, request.split]
     words += [] if request.videos is None else [str(request.videos)]
-    words += [] if usual else [_digest(request.scoring.model_dump())]
+    words += [] if usual else [_digest(request.scoring.model_dump(exclude_defaults=True))]
     return (run if in_run else Path(request.paths.outputs)) / "evaluate" / "_".join(words)
 
 
