@@ -87,7 +87,7 @@ class Learner(L.LightningModule):
         """The scheduled values at this step; filled on the device, so that nothing waits for a copy."""
         return {name: torch.full((), value(self.step), device=self.device) for name, value in self._schedules.items()}
 
-    def loss(self, terms: Mapping[str, Float[Tensor, "B"]]) -> Float[Tensor, ""]:
+    def loss(self, terms: Mapping[str, Float[Tensor, " B"]]) -> Float[Tensor, ""]:
         """The batch's mean of the weighted sum of terms.
 
         Raises:
@@ -222,7 +222,7 @@ def as_float(video: UInt8[Tensor, "B T 3 H W"]) -> Float[Tensor, "B T 3 H W"]:
     return video.float() / 255.0
 
 
-def foreground_share(scene: Scene, identities: Int[Tensor, "B T H W"]) -> Float[Tensor, "B"]:
+def foreground_share(scene: Scene, identities: Int[Tensor, "B T H W"]) -> Float[Tensor, " B"]:
     """Share of a video's pixels that the model gives to objects, not to its background."""
     backgrounds = background_identities(scene)
     given = [

@@ -42,12 +42,12 @@ class Scene:
     """
 
     masks: Float[Tensor, "B T K H W"]
-    background: Bool[Tensor, "K"]
+    background: Bool[Tensor, " K"]
     ids: Int[Tensor, "B T K"]
     presence: Float[Tensor, "B T K"]
     appearance: Float[Tensor, "B T K A"]
     reconstruction: Float[Tensor, "B T 3 H W"]
-    terms: dict[str, Float[Tensor, "B"]]
+    terms: dict[str, Float[Tensor, " B"]]
     windows: Float[Tensor, "B T K 4"] | None = None
     means: Float[Tensor, "B T K 3 H W"] | None = None
     diagnostics: dict[str, Tensor] = field(default_factory=dict)

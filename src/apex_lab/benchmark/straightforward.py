@@ -42,7 +42,7 @@ class PlainMixture(MixtureLikelihood):
         background: Float[Tensor, "N 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
-    ) -> Float[Tensor, "N"]:
+    ) -> Float[Tensor, " N"]:
         sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
         by_object = log_normal(image[:, None], objects, sigma_fg)
         by_background = log_normal(image, background, sigma_bg)

@@ -40,8 +40,8 @@ def boundary_scores(
     prediction: Integer[np.ndarray, "T H W"],
     truth: Integer[np.ndarray, "T H W"],
     counts: Int64[np.ndarray, "T G P"],
-    labels: Int64[np.ndarray, "G"],
-    ids: Int64[np.ndarray, "P"],
+    labels: Int64[np.ndarray, " G"],
+    ids: Int64[np.ndarray, " P"],
     tolerance: float = TOLERANCE,
 ) -> BoundaryScores:
     """Scores the objects of one video in the order of `labels[1:]`.
@@ -60,7 +60,7 @@ def boundary_scores(
     return BoundaryScores(j, f.reshape(len(truth), -1).T)
 
 
-def assign_tracks(counts: Int64[np.ndarray, "T G P"]) -> tuple[Float64[np.ndarray, "O T"], Int64[np.ndarray, "O"]]:
+def assign_tracks(counts: Int64[np.ndarray, "T G P"]) -> tuple[Float64[np.ndarray, "O T"], Int64[np.ndarray, " O"]]:
     """One-to-one assignment of objects and predicted tracks with the largest mean J.
 
     Returns:
@@ -78,7 +78,7 @@ def assign_tracks(counts: Int64[np.ndarray, "T G P"]) -> tuple[Float64[np.ndarra
 
 def boundary_measure(
     found: Bool[np.ndarray, "O H W"], true: Bool[np.ndarray, "O H W"], radius: int
-) -> Float64[np.ndarray, "O"]:
+) -> Float64[np.ndarray, " O"]:
     """F of O pairs of masks, in [0, 1]; 1 where neither mask has a boundary.
 
     Args:

@@ -40,13 +40,13 @@ class HotaCounts:
         location: sum of IoU over true positives.
     """
 
-    true_positives: Int64[np.ndarray, "A"]
-    misses: Int64[np.ndarray, "A"]
-    false_positives: Int64[np.ndarray, "A"]
-    association: Float64[np.ndarray, "A"]
-    recall: Float64[np.ndarray, "A"]
-    precision: Float64[np.ndarray, "A"]
-    location: Float64[np.ndarray, "A"]
+    true_positives: Int64[np.ndarray, " A"]
+    misses: Int64[np.ndarray, " A"]
+    false_positives: Int64[np.ndarray, " A"]
+    association: Float64[np.ndarray, " A"]
+    recall: Float64[np.ndarray, " A"]
+    precision: Float64[np.ndarray, " A"]
+    location: Float64[np.ndarray, " A"]
 
     @staticmethod
     def of_video(frames: Sequence[Detections], shape: tuple[int, int]) -> HotaCounts:
@@ -87,7 +87,7 @@ class HotaCounts:
         exact = {name: np.array([math.fsum(getattr(v, name)[a] for v in videos) for a in range(19)]) for name in floats}
         return HotaCounts(**summed, **exact)
 
-    def curves(self) -> dict[str, Float64[np.ndarray, "A"]]:
+    def curves(self) -> dict[str, Float64[np.ndarray, " A"]]:
         """`hota deta assa detre detpr assre asspr loca` per threshold, each in [0, 1].
 
         All NaN where nothing was there to find and nothing was found; without any true positive all are 0 but LocA,
@@ -118,7 +118,7 @@ class HotaCounts:
 
 
 def _track_agreement(
-    frames: Sequence[Detections], true_count: Int64[np.ndarray, "G"], found_count: Int64[np.ndarray, "P"]
+    frames: Sequence[Detections], true_count: Int64[np.ndarray, " G"], found_count: Int64[np.ndarray, " P"]
 ) -> Float64[np.ndarray, "G P"]:
     """Jaccard overlap of every two tracks over the video, with IoUs that compete in a frame sharing one vote."""
     together = np.zeros((len(true_count), len(found_count)))
@@ -129,7 +129,7 @@ def _track_agreement(
     return together / np.where(either > 0, either, 1)
 
 
-def _sum_of_shares(pairs: Int64[np.ndarray, "A G P"], whole: Int64[np.ndarray, "..."]) -> Float64[np.ndarray, "A"]:
+def _sum_of_shares(pairs: Int64[np.ndarray, "A G P"], whole: Int64[np.ndarray, "..."]) -> Float64[np.ndarray, " A"]:
     """Over all true positives of each threshold: the share that their pair's true positives have of `whole`."""
     shares = pairs * (pairs / np.maximum(whole, 1))
     return np.array([math.fsum(of_alpha.ravel()) for of_alpha in shares])

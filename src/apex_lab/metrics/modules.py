@@ -128,7 +128,7 @@ class SceneMetrics(Metric):
         self.add_state("empty_frames", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
         self.add_state("rows", [], dist_reduce_fx="cat")
 
-    def update(self, prediction: Labels, truth: Labels, index: Int64[Tensor, "B"] | None = None) -> None:
+    def update(self, prediction: Labels, truth: Labels, index: Int64[Tensor, " B"] | None = None) -> None:
         """Adds a batch of videos.
 
         Args:

@@ -29,7 +29,7 @@ class ObjectMetadata:
         contact: whether the object touched another one (or the arm) since the frame before; None if unknown.
     """
 
-    labels: Integer[np.ndarray, "L"]
+    labels: Integer[np.ndarray, " L"]
     classes: Sequence[str]
     occlusion: Float[np.ndarray, "T L"] | None = None
     contact: Bool[np.ndarray, "T L"] | None = None
@@ -57,7 +57,7 @@ def p2d_metadata(meta: Mapping[str, Any]) -> ObjectMetadata:
 
 def object_rows(
     counts: Int64[np.ndarray, "T G P"],
-    labels: Int64[np.ndarray, "G"],
+    labels: Int64[np.ndarray, " G"],
     metadata: ObjectMetadata | None = None,
     boundary: BoundaryScores | None = None,
     frames: Sequence[Detections] = (),
@@ -142,7 +142,7 @@ def _intervals(values: pd.Series, bins: int) -> pd.Series:
 
 
 def _metadata_columns(
-    labels: Int64[np.ndarray, "O"], seen: Bool[np.ndarray, "T O"], metadata: ObjectMetadata | None
+    labels: Int64[np.ndarray, " O"], seen: Bool[np.ndarray, "T O"], metadata: ObjectMetadata | None
 ) -> dict[str, object]:
     if metadata is None:
         return {"class": None, "occlusion": np.nan, "contact": np.nan}
@@ -164,12 +164,12 @@ def _metadata_columns(
 
 
 def _tracking_columns(
-    frames: Sequence[Detections], events: Events | None, labels: Int64[np.ndarray, "G"]
+    frames: Sequence[Detections], events: Events | None, labels: Int64[np.ndarray, " G"]
 ) -> dict[str, object]:
     if events is None:
         return dict.fromkeys(("occurrences", "detected", "tracked", "switches"), np.nan)
 
-    def per_object(rows: np.ndarray) -> Int64[np.ndarray, "O"]:
+    def per_object(rows: np.ndarray) -> Int64[np.ndarray, " O"]:
         return np.bincount(rows, minlength=len(labels))[1:]
 
     occurrences = per_object(np.concatenate([np.empty(0, dtype=np.int64), *(f.rows for f in frames)]))
@@ -183,7 +183,7 @@ def _tracking_columns(
     }
 
 
-def _mean_where(values: np.ndarray, where: Bool[np.ndarray, "T O"]) -> Float[np.ndarray, "O"]:
+def _mean_where(values: np.ndarray, where: Bool[np.ndarray, "T O"]) -> Float[np.ndarray, " O"]:
     """Mean over the chosen frames, NaN values left out; NaN where no frame is left."""
     where = where & ~np.isnan(values)
     count = where.sum(axis=0)

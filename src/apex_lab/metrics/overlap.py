@@ -44,5 +44,5 @@ def mean_matched_iou(counts: Int64[np.ndarray, "G P"]) -> float:
     return _mean(np.pad(matched, (0, len(visible) - len(matched))))
 
 
-def _mean(values: Float64[np.ndarray, "N"]) -> float:
+def _mean(values: Float64[np.ndarray, " N"]) -> float:
     return math.fsum(values) / len(values) if len(values) else math.nan

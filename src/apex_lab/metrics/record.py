@@ -115,8 +115,8 @@ class _Table:
 
     batch: Contingency
     counts: Int64[np.ndarray, "T G P"]
-    labels: Int64[np.ndarray, "G"]
-    ids: Int64[np.ndarray, "P"]
+    labels: Int64[np.ndarray, " G"]
+    ids: Int64[np.ndarray, " P"]
 
 
 def score_video(
@@ -164,7 +164,7 @@ def tracking_values(clear: TrackingCounts, identity: IdentityCounts, suffix: str
     return {name + suffix: value for name, value in values.items()}
 
 
-def _frame_scores(table: _Table, skip_empty: bool) -> dict[str, Float64[np.ndarray, "T"]]:
+def _frame_scores(table: _Table, skip_empty: bool) -> dict[str, Float64[np.ndarray, " T"]]:
     scores = {name: video_scores(table.batch, name, "frame", skip_empty)[0].numpy() for name in SCORES}
     scores["mbo"] = np.array([mean_best_overlap(frame) for frame in table.counts])
     scores["miou"] = np.array([mean_matched_iou(frame) for frame in table.counts])
@@ -205,7 +205,7 @@ def _event_table(events: Events, table: _Table) -> Float64[np.ndarray, "N 5"]:
     return np.column_stack([events.frame, events.type, label, identity, events.distance])
 
 
-def _boundary_columns(boundary: BoundaryScores) -> dict[str, Float64[np.ndarray, "T"]]:
+def _boundary_columns(boundary: BoundaryScores) -> dict[str, Float64[np.ndarray, " T"]]:
     if not len(boundary.j):
         return {}
     j, f = boundary.j.mean(axis=0), boundary.f.mean(axis=0)
@@ -214,9 +214,9 @@ def _boundary_columns(boundary: BoundaryScores) -> dict[str, Float64[np.ndarray,
 
 def _tracking_columns(
     frames: Sequence[Detections], events: Events, n_frames: int
-) -> dict[str, Float64[np.ndarray, "T"]]:
+) -> dict[str, Float64[np.ndarray, " T"]]:
     """Tracking values per frame; NaN in frames that are not evaluated."""
-    columns: dict[str, Float64[np.ndarray, "T"]] = {}
+    columns: dict[str, Float64[np.ndarray, " T"]] = {}
     for found in frames:
         here = events.frame == found.frame
         part = Events(*(getattr(events, name)[here] for name in ("frame", "type", "row", "column", "distance")))
@@ -226,7 +226,7 @@ def _tracking_columns(
     return columns
 
 
-def _rows(columns: dict[str, Float64[np.ndarray, "T"]], n_frames: int) -> list[dict[str, Number]]:
+def _rows(columns: dict[str, Float64[np.ndarray, " T"]], n_frames: int) -> list[dict[str, Number]]:
     def value(name: str, frame: int) -> Number:
         number = float(columns[name][frame]) if name in columns else math.nan
         return int(number) if name.startswith("num_") and not math.isnan(number) else number
@@ -246,6 +246,6 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _sum_and_count(values: Float64[np.ndarray, "T"]) -> tuple[float, int]:
+def _sum_and_count(values: Float64[np.ndarray, " T"]) -> tuple[float, int]:
     known: Any = values[~np.isnan(values)]
     return math.fsum(known), len(known)

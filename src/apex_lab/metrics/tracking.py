@@ -80,8 +80,8 @@ class Detections:
     """
 
     frame: int
-    rows: Int64[np.ndarray, "n"]
-    columns: Int64[np.ndarray, "m"]
+    rows: Int64[np.ndarray, " n"]
+    columns: Int64[np.ndarray, " m"]
     iou: Float64[np.ndarray, "n m"]
 
 
@@ -121,11 +121,11 @@ class Events:
         distance: 1 - IoU; NaN for FP and MISS.
     """
 
-    frame: Int64[np.ndarray, "N"]
-    type: Int64[np.ndarray, "N"]
-    row: Int64[np.ndarray, "N"]
-    column: Int64[np.ndarray, "N"]
-    distance: Float64[np.ndarray, "N"]
+    frame: Int64[np.ndarray, " N"]
+    type: Int64[np.ndarray, " N"]
+    row: Int64[np.ndarray, " N"]
+    column: Int64[np.ndarray, " N"]
+    distance: Float64[np.ndarray, " N"]
 
     def of(self, *names: str) -> np.ndarray:
         """Which events are of these types, (N,) bool."""

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def pixel_centres(n: int, like: Tensor) -> Float[Tensor, "n"]:
+def pixel_centres(n: int, like: Tensor) -> Float[Tensor, " n"]:
     """Centres of `n` pixels on the axis [-1, 1]."""
     return (2 * torch.arange(n, device=like.device, dtype=like.dtype) + 1) / n - 1
 

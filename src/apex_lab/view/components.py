@@ -43,9 +43,9 @@ class Life:
 
     identity: int
     background: bool
-    component: Int[np.ndarray, "T"]
-    presence: Float[np.ndarray, "T"]
-    share: Float[np.ndarray, "T"]
+    component: Int[np.ndarray, " T"]
+    presence: Float[np.ndarray, " T"]
+    share: Float[np.ndarray, " T"]
 
     @property
     def color(self) -> Color:
@@ -53,7 +53,7 @@ class Life:
         return _BACKGROUND_TONE if self.background else color_of(self.identity)
 
     @property
-    def frames(self) -> Int[np.ndarray, "F"]:
+    def frames(self) -> Int[np.ndarray, " F"]:
         """Frames in which it is there."""
         return np.flatnonzero(self.component >= 0)
 

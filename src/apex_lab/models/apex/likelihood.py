@@ -83,7 +83,7 @@ class Likelihood(ABC):
         background: Float[Tensor, "N 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
-    ) -> Float[Tensor, "N"]:
+    ) -> Float[Tensor, " N"]:
         """Log-likelihood of each image in nats.
 
         Args:
@@ -122,7 +122,7 @@ class MixtureLikelihood(Likelihood):
         background: Float[Tensor, "N 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
-    ) -> Float[Tensor, "N"]:
+    ) -> Float[Tensor, " N"]:
         sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
         if self.mixture_over == "channel":
             args = (image, log_objects, objects, log_background, background, sigma_fg, sigma_bg)
@@ -138,7 +138,7 @@ class MixtureLikelihood(Likelihood):
         image: Float[Tensor, "N 3 H W"],
         masks: Float[Tensor, "N K H W"],
         means: Float[Tensor, "N K 3 H W"],
-        background: Bool[Tensor, "K"],
+        background: Bool[Tensor, " K"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N K H W"]:
@@ -182,7 +182,7 @@ class GaussianLikelihood(Likelihood):
         background: Float[Tensor, "N 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
-    ) -> Float[Tensor, "N"]:
+    ) -> Float[Tensor, " N"]:
         blend = (log_objects.exp()[:, :, None] * objects).sum(1) + log_background.exp()[:, None] * background
         sigma = _scaled(image.new_full((), self.sigma), scale_fg)
         return log_normal(image, blend, sigma).flatten(1).sum(1)

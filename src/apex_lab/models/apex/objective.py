@@ -56,7 +56,7 @@ def kl_terms(
     discovery_pres: Float[Tensor, "B T D"],
     prior: DiscoveryPrior,
     direction: Direction,
-) -> dict[str, Float[Tensor, "B"]]:
+) -> dict[str, Float[Tensor, " B"]]:
     """KL terms of all foreground objects, summed over frames (Eq. 3): their part of Eq. 20.
 
     Those of z_what and z_where are weighted by presence, the exponents of Eq. 5 (propagated) and Eq. 6 (discovered).

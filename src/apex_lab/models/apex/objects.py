@@ -69,7 +69,7 @@ def sample_presence(prob: Tensor, temperature: Tensor, stochastic: bool) -> Tens
     return relaxed_bernoulli(prob, temperature) if stochastic else (prob > 0.5).to(prob.dtype)
 
 
-def _set_last_bias(network: nn.Sequential, values: Float[Tensor, "n"], shrink: float = 0.1) -> None:
+def _set_last_bias(network: nn.Sequential, values: Float[Tensor, " n"], shrink: float = 0.1) -> None:
     """Starts a head at a chosen output: small weights, given biases."""
     last = network[-1]
     assert isinstance(last, nn.Linear)

@@ -31,7 +31,7 @@ def carry(
     presence: Float[Tensor, "B P_plus_N"],
     valid: Bool[Tensor, "B P_plus_N"],
     ids: Int[Tensor, "B P"],
-    next_id: Int[Tensor, "B"],
+    next_id: Int[Tensor, " B"],
     threshold: float,
 ) -> Carried:
     """Drops objects with a presence below the threshold and carries on the P strongest.

@@ -30,9 +30,9 @@ class _Frame:
     """Connected regions of one frame: number of each pixel's region, and what is known of each region."""
 
     region: Int[np.ndarray, "H W"]
-    cluster: Int[np.ndarray, "R"]
-    area: Int[np.ndarray, "R"]
-    border: Bool[np.ndarray, "R"]
+    cluster: Int[np.ndarray, " R"]
+    area: Int[np.ndarray, " R"]
+    border: Bool[np.ndarray, " R"]
 
 
 class ColorClusters(SceneModel):
