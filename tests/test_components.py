@@ -110,7 +110,7 @@ class Loose:
         unhinted,  # type: ignore[no-untyped-def]
         anything: Any,
         maybe: Any | None,
-        unknown: " NoSuchName",  # type: ignore[name-defined]
+        unknown: NoSuchName,  # type: ignore[name-defined]  # noqa: F821
         called: Callable[[int], int],
         several: Sequence[Part],
         array: Float[Tensor, "3"],
