@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from apex_lab import components
 from apex_lab.errors import UserError
-from apex_lab.optimizers import QUINTIC, Muon, is_matrix, orthogonalised
+from apex_lab.optimizers import QUINTIC, Muon, all_orthogonalised, is_matrix, orthogonalised
 
 
 def test_orthogonalised_keeps_singular_vectors_and_maps_singular_values_by_the_quintic() -> None:
@@ -33,6 +33,16 @@ def test_orthogonalised_is_exact_enough_in_float32_where_gradients_are_nearly_of
     v, _ = torch.linalg.qr(torch.randn(288, 64, dtype=torch.float64, generator=generator))
     x = u @ torch.logspace(0, -8, 64, dtype=torch.float64).diag() @ v.T
     torch.testing.assert_close(orthogonalised(x.float()).double(), orthogonalised(x), rtol=0.0, atol=1e-2)
+
+
+def test_matrices_that_are_iterated_together_do_not_see_each_other() -> None:
+    g = torch.Generator().manual_seed(6)
+    shapes = [(4, 9), (9, 4), (6, 6), (4, 4), (12, 6), (1, 5), (4, 30)]
+    matrices = [10.0**i * torch.randn(shape, dtype=torch.float64, generator=g) for i, shape in enumerate(shapes)]
+    matrices.append(torch.zeros(6, 7, dtype=torch.float64))
+    together = all_orthogonalised(matrices)
+    for each, alone in zip(together, matrices, strict=True):
+        torch.testing.assert_close(each, orthogonalised(alone), rtol=1e-10, atol=1e-12)
 
 
 def test_orthogonalised_does_not_depend_on_the_scale_and_leaves_zeros() -> None:

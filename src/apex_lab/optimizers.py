@@ -6,8 +6,8 @@ convolutions too, computes in the weights' own precision, and is one optimiser w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Annotated, Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Annotated, Any, cast
 
 import torch
 from jaxtyping import Float
@@ -32,17 +32,32 @@ def orthogonalised(matrix: Float[Tensor, "rows columns"], iterations: int = 5) -
     are multiplied by at most 485. Newton-Schulz iteration x <- (a + b x x^T + c (x x^T)^2) x, carried out on the small
     square x x^T and applied to the matrix once. A matrix whose norm is far below `NOTHING` goes to zero.
     """
+    return all_orthogonalised([matrix], iterations)[0]
+
+
+def all_orthogonalised(matrices: Sequence[Float[Tensor, "_ _"]], iterations: int = 5) -> list[Tensor]:
+    """`orthogonalised` of each matrix; those whose smaller side is equally long are iterated together."""
+    wide = [m if m.shape[0] <= m.shape[1] else m.T for m in matrices]
+    norms = torch.stack(torch._foreach_norm(wide)).clamp_min(NOTHING)
+    wide = list(torch._foreach_div(wide, list(norms.unbind())))
+    applied: list[Tensor] = list(wide)
+    for side in sorted({len(x) for x in wide}):
+        chosen = [i for i, x in enumerate(wide) if len(x) == side]
+        iterated = _newton_schulz(torch.stack([wide[i] @ wide[i].T for i in chosen]), iterations)
+        for i, factor in zip(chosen, iterated.unbind(), strict=True):
+            applied[i] = factor @ wide[i]
+    return [x if m.shape[0] <= m.shape[1] else x.T for x, m in zip(applied, matrices, strict=True)]
+
+
+def _newton_schulz(gram: Float[Tensor, "N n n"], iterations: int) -> Float[Tensor, "N n n"]:
+    """What matrices with these x x^T are to be multiplied by from the left."""
     a, b, c = QUINTIC
-    wide = matrix.shape[0] <= matrix.shape[1]
-    x = matrix if wide else matrix.T
-    x = x / x.norm().clamp_min(NOTHING)
-    gram, applied = x @ x.T, torch.eye(len(x), dtype=x.dtype, device=x.device)
+    applied = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device).expand_as(gram)
     for _ in range(iterations):
-        step = torch.addmm(gram, gram, gram, beta=b, alpha=c)
-        step.diagonal().add_(a)
+        step = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)
+        step.diagonal(dim1=-2, dim2=-1).add_(a)
         applied, gram = step @ applied, step @ gram @ step
-    x = applied @ x
-    return x if wide else x.T
+    return applied
 
 
 def is_matrix(weight: Tensor) -> bool:
@@ -96,21 +111,27 @@ class Muon(Optimizer):
             with torch.enable_grad():
                 loss = closure()
         for group in self.param_groups:
-            update = self._muon if group["matrices"] else self._adam
-            for weight in group["params"]:
-                if weight.grad is not None:
-                    update(weight, weight.grad, self.state[weight], group)
+            weights = [weight for weight in group["params"] if weight.grad is not None]
+            if group["matrices"]:
+                self._muon(weights, group)
+            else:
+                for weight in weights:
+                    self._adam(weight, weight.grad, self.state[weight], group)
         return loss
 
-    @staticmethod
-    def _muon(weight: Tensor, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
-        if not state:
-            state["momentum"] = torch.zeros_like(weight)
-        momentum = state["momentum"].lerp_(grad, 1 - group["momentum"])
-        ahead = grad.lerp(momentum, group["momentum"]).flatten(1)
-        rows, columns = ahead.shape
-        stretch = max(1.0, rows / columns) ** 0.5
-        weight.sub_(orthogonalised(ahead, group["iterations"]).view_as(weight), alpha=group["lr"] * stretch)
+    def _muon(self, weights: Sequence[Tensor], group: dict[str, Any]) -> None:
+        if not weights:
+            return
+        for weight in weights:
+            if not self.state[weight]:
+                self.state[weight]["momentum"] = torch.zeros_like(weight)
+        grads = [cast(Tensor, weight.grad) for weight in weights]
+        momenta = [self.state[weight]["momentum"] for weight in weights]
+        torch._foreach_lerp_(momenta, grads, 1 - group["momentum"])
+        ahead = [x.flatten(1) for x in torch._foreach_lerp(grads, momenta, group["momentum"])]
+        for weight, change in zip(weights, all_orthogonalised(ahead, group["iterations"]), strict=True):
+            stretch = max(1.0, change.shape[0] / change.shape[1]) ** 0.5
+            weight.sub_(change.reshape(weight.shape), alpha=group["lr"] * stretch)
 
     @staticmethod
     def _adam(weight: Tensor, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from apex_lab.nn.spatial_transformer import Paster, crop, paste, pixel_centres
+from apex_lab.nn.spatial_transformer import Paster, _triangle, crop, paste, pixel_centres
 
 
 def windows(n: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -84,3 +84,17 @@ def test_gradients_by_finite_differences() -> None:
     window = windows(2, g).requires_grad_()
     assert torch.autograd.gradcheck(lambda i, w: crop(i, w[None], 4), (image, window))
     assert torch.autograd.gradcheck(lambda x, w: paste(x, w, 9), (glimpse, window))
+
+
+def test_the_gradient_of_the_weights_is_that_of_autograd() -> None:
+    g = torch.Generator().manual_seed(7)
+    inside = 12 * torch.rand(200, generator=g, dtype=torch.float64) - 2  # some just outside of 0..7
+    far = torch.tensor([-1e6, -2.5, -1.5, 8.5, 9.5, 1e6], dtype=torch.float64)
+    position = torch.cat([inside, far]).requires_grad_()
+    plainly = (1 - (position[:, None] - torch.arange(8)).abs()).clamp_min(0)
+    weights = torch.randn(206, 8, generator=g, dtype=torch.float64)
+    torch.testing.assert_close(_triangle(position, 8), plainly)
+    [wanted] = torch.autograd.grad((plainly * weights).sum(), position)
+    [found] = torch.autograd.grad((_triangle(position, 8) * weights).sum(), position)
+    torch.testing.assert_close(found, wanted)
+    assert wanted.count_nonzero() > 100

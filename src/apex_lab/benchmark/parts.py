@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 import apex_lab.models.apex.model as apex
+import apex_lab.models.apex.result as result
 from apex_lab.models.apex import Apex
 from apex_lab.scene import SceneModel
 
@@ -113,8 +114,8 @@ def _entries(model: Apex) -> list[tuple[Any, str, str]]:
         (model, "likelihood", "likelihood"),
         (apex, "kl_terms", "other terms"),
         (apex, "kl_gaussian", "other terms"),
-        (apex, "mask_entropy", "other terms"),
-        (model, "_scene", REST),
+        (result, "mask_entropy", "other terms"),
+        (apex, "scene_of", REST),
     ]
 
 

@@ -4,7 +4,7 @@ The same parts, weights, equations and loss terms, and as wide. What differs is 
 
 - everything happens frame by frame inside the loop over time: encoder, discovery, rendering, likelihood, KL, result;
 - every crop and paste is an `affine_grid` and a `grid_sample` with a picture of its own for every component;
-- the mixture likelihood is a `logsumexp` differentiated by autograd;
+- the mixture likelihood is a `logsumexp`, and it and p_context are differentiated by autograd;
 - `render_top=None` renders all cells of discovery, as the published equations do; a number renders as many as APEX.
 """
 
@@ -14,19 +14,22 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
 from apex_lab.benchmark.grid import GridPaster, grid_crop
 from apex_lab.models.apex.likelihood import MixtureLikelihood, log_normal
-from apex_lab.models.apex.masks import Masks
+from apex_lab.models.apex.masks import ApexNormalisation, Masks
 from apex_lab.models.apex.model import FIRST_ID, Apex
-from apex_lab.models.apex.objective import kl_terms, mask_entropy
+from apex_lab.models.apex.objective import kl_terms
 from apex_lab.models.apex.objects import Objects, Proposals, context_probability, sample_presence, scope_in_windows
+from apex_lab.models.apex.result import Drawn, scene_of, video_of
 from apex_lab.models.apex.rollout import Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import Carried, carry, gather_slots
 from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian, kl_gaussian
+from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.scene import ABSENT, Scene, Schedule
 
 
@@ -54,6 +57,16 @@ class PlainMixture(MixtureLikelihood):
         return torch.logsumexp(joint, dim=1).flatten(1).sum(1)
 
 
+class PlainNormalisation(ApexNormalisation):
+    """APEX's mask normalisation with the gradient of claims left to autograd."""
+
+    def claim(self, alpha: Float[Tensor, "... K g g"], paster: Paster) -> Float[Tensor, "... K H W"]:
+        """As `ApexNormalisation.claim`."""
+        rows, columns = paster.inside()
+        warped = paster.each(alpha[..., None, :, :]).squeeze(-3)
+        return torch.tanh(F.softplus(warped)) * rows[..., :, None] * columns[..., None, :]
+
+
 class _Memory:
     """What a frame hands to the next one."""
 
@@ -75,6 +88,8 @@ class Straightforward(Apex):
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.glimpses.crop = grid_crop
+        if isinstance(self.masks, ApexNormalisation):
+            self.masks = PlainNormalisation(self.masks.c, self.masks.outside)
         if isinstance(self.likelihood, MixtureLikelihood):
             plain = self.likelihood
             self.likelihood = PlainMixture(plain.sigma_fg, plain.sigma_bg, plain.mixture_over)
@@ -124,18 +139,12 @@ class Straightforward(Apex):
         alpha, alphas = self._alpha(before.what), self._alpha(proposals.what[:, 0])
         scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
         paster = self._paster(proposals.place[:, 0], alphas.shape[-1])
-        rows, columns = paster.inside()
         claims = self.masks.claim(alphas, paster)
-        [cells] = frames_of(
-            look_at[:, None],
-            follow_in[:, None],
-            proposals,
-            *(x[:, None] for x in (alphas, claims, rows, columns)),
-        )
+        [cells] = frames_of(look_at[:, None], follow_in[:, None], proposals, alphas[:, None])
 
         open_ = self._may_discover(memory.carried_on, schedule).to(scope.dtype)
         prob = cells.prob * context_probability(scope, claims) * open_
-        prior = schedule["discovery_presence"] * scope_in_windows(scope, rows, columns) * open_
+        prior = schedule["discovery_presence"] * scope_in_windows(scope, *paster.inside()) * open_
         pres = sample_presence(prob, temperature, self.training) * open_
         top = prob.detach().topk(self.render_top, dim=1).indices
         candidates = Objects.join(before, self._found(cells, pres, top))
@@ -175,23 +184,18 @@ class Straightforward(Apex):
     ) -> Scene:
         """Rendering, likelihood, KL and the result of one frame."""
         steps = stack_steps([step])
-        paster = self._paster(steps.place, steps.alpha.shape[-1])
-        masks = self.masks.compose(steps.alpha, steps.presence, steps.valid, paster)
-        colours = torch.sigmoid(self.colour_decoder(steps.what.flatten(0, 2))).unflatten(0, steps.presence.shape)
-        means = paster.each(colours)
+        alpha, presence, valid, place, what = (
+            x[:, 0] for x in (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)
+        )
+        paster = self._paster(place, alpha.shape[-1])
+        masks = self.masks.compose(alpha, presence, valid, paster)
         backdrop, kl_background = self._backdrop(frame[:, 0], masks, memory)
-        log_likelihood = self.likelihood(
-            frame[:, 0],
-            masks.log_objects[:, 0],
-            means[:, 0],
-            masks.log_background[:, 0],
-            backdrop,
-            schedule["sigma_fg_scale"],
-            schedule["sigma_bg_scale"],
+        picture = self._picture(
+            frame[:, 0], Drawn(alpha, presence, valid, place, what), paster, masks, backdrop, schedule
         )
         slots = self.max_objects
         terms = {
-            "nll": -log_likelihood,
+            "nll": -picture.log_likelihood,
             **kl_terms(
                 steps.propagated,
                 steps.alive,
@@ -204,13 +208,13 @@ class Straightforward(Apex):
                 self.direction,
             ),
             "kl_background": kl_background,
-            "mask_entropy": mask_entropy(masks).sum(1),
+            "mask_entropy": picture.mask_entropy,
         }
-        return self._scene(steps, masks, means, backdrop[:, None], terms)
+        return scene_of(steps, video_of([picture], len(frame)), terms)
 
     def _backdrop(self, frame: Tensor, masks: Masks, memory: _Memory) -> tuple[Tensor, Tensor]:
         """The background's picture (B, 3, H, W) and what its latent costs (B,)."""
-        q = self.background.posterior(masks.background[:, 0], frame)
+        q = self.background.posterior(masks.background, frame)
         z = q.sample(self.training)
         history = [z] if memory.z_background is None else [memory.z_background, z]
         p = self.background.prior(torch.stack(history, dim=1))

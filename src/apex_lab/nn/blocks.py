@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import pixel_centres
 
 
@@ -83,6 +84,7 @@ class SubpixelDecoder(nn.Module):
             blocks += [nn.Conv2d(inputs, 4 * after, 3, padding=1), nn.PixelShuffle(2), group_norm(after), nn.CELU()]
         self.blocks = nn.Sequential(*blocks)
         self.head = nn.Sequential(nn.Conv2d(width, 4 * outputs, 3, padding=1), nn.PixelShuffle(2))
+        self.largest = max(width, 4 * outputs) * (size // 2) ** 2
 
     def start_at(self, value: float) -> None:
         """Sets the last bias, so that an untrained decoder's pictures vary around `value`."""
@@ -92,7 +94,8 @@ class SubpixelDecoder(nn.Module):
         nn.init.constant_(last.bias, value)
 
     def forward(self, latent: Float[Tensor, "N latent"]) -> Float[Tensor, "N outputs size size"]:
-        return self.head(self.blocks(self.stem(latent)))
+        size = part_size(len(latent), self.largest, latent)
+        return joined(self.head(self.blocks(part)) for part in self.stem(latent).split(size))
 
 
 class BroadcastDecoder(nn.Module):

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from apex_lab.nn.blocks import conv_norm, group_norm
+from apex_lab.nn.parts import joined, part_size
 
 
 class ResidualBlock(nn.Module):
@@ -99,6 +100,7 @@ class DLA(nn.Module):
         super().__init__()
         if len(widths) != 6 or len(depths) != 4:
             raise ValueError(f"DLA takes 6 widths and 4 depths, got {list(widths)} and {list(depths)}")
+        self.widest = widths[0]
         self.stem = nn.Sequential(
             conv_norm(3, widths[0], kernel=7),
             conv_norm(widths[0], widths[0]),
@@ -118,7 +120,9 @@ class DLA(nn.Module):
         self.head = nn.Conv2d(strides[-1], features, 1)
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N F H/4 W/4"]:
-        x = self.stem(images)
+        # At full resolution images are many and weights few: in parts.
+        size = part_size(len(images), self.widest * images[0, 0].numel(), images)
+        x = joined(self.stem(part) for part in images.split(size))
         maps = []
         for tree in self.trees:
             x = tree(x)

@@ -11,6 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from apex_lab.nn.blocks import GlimpseEncoder
+from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import crop
 
 Size = Annotated[int, Field(ge=4, le=128)]
@@ -55,7 +56,13 @@ class Glimpses(nn.Module, ABC):
         return self._encode(self.propagation, source, window)
 
     def _encode(self, encoder: nn.Module, source: Tensor, window: Tensor) -> Tensor:
-        return encoder(self.crop(source, window, self.size).flatten(0, 1)).unflatten(0, window.shape[:2])
+        windows = window.shape[1]
+        largest = windows * self.size**2 * max(self.width, source.shape[1])
+        size = part_size(len(source), largest, source)
+        return joined(
+            encoder(self.crop(images, places, self.size).flatten(0, 1)).unflatten(0, (-1, windows))
+            for images, places in zip(source.split(size), window.split(size), strict=True)
+        )
 
 
 class FeatureGlimpses(Glimpses):

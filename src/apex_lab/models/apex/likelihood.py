@@ -24,7 +24,7 @@ class _LogMixture(torch.autograd.Function):
     """log sum_k exp(log_m_k + log N(x; mu_k, sigma_k)) per pixel and channel, with its gradient written by hand.
 
     This is the largest computation of a training step: plain autograd keeps some ten tensors of the size of all
-    components' pictures, this keeps two (the differences and the responsibilities).
+    components' pictures, this keeps the responsibilities alone.
     """
 
     @staticmethod
@@ -39,10 +39,9 @@ class _LogMixture(torch.autograd.Function):
         sigma_bg: Tensor,
     ) -> Tensor:
         """Shapes as in `Likelihood.__call__`, sigmas 0-dim -> log density (N, 3, H, W) in nats."""
-        from_objects = image[:, None] - objects
-        from_background = image - background
-        by_object = from_objects.square().mul_(-0.5 / sigma_fg**2).add_((log_objects - sigma_fg.log())[:, :, None])
-        by_background = from_background.square().mul_(-0.5 / sigma_bg**2)
+        by_object = (image[:, None] - objects).square_().mul_(-0.5 / sigma_fg**2)
+        by_object += (log_objects - sigma_fg.log())[:, :, None]
+        by_background = (image - background).square_().mul_(-0.5 / sigma_bg**2)
         by_background += (log_background - sigma_bg.log())[:, None]
         highest = torch.maximum(by_object.amax(1), by_background)
         shares = by_object.sub_(highest[:, None]).exp_()
@@ -50,18 +49,18 @@ class _LogMixture(torch.autograd.Function):
         total = shares.sum(1) + share_background
         shares /= total[:, None]
         share_background /= total
-        ctx.save_for_backward(shares, share_background, from_objects, from_background)
+        ctx.save_for_backward(shares, share_background, image, objects, background)
         ctx.precision = (1 / sigma_fg**2, 1 / sigma_bg**2)
         return total.log_().add_(highest).sub_(0.5 * math.log(2 * math.pi))
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        shares, share_background, from_objects, from_background = ctx.saved_tensors
+        shares, share_background, image, objects, background = ctx.saved_tensors
         precision_fg, precision_bg = ctx.precision
         by_object, by_background = shares * grad[:, None], share_background * grad
         to_log_objects, to_log_background = by_object.sum(2), by_background.sum(1)
-        to_objects = by_object.mul_(from_objects).mul_(precision_fg)
-        to_background = by_background.mul_(from_background).mul_(precision_bg)
+        to_objects = by_object.mul_(image[:, None] - objects).mul_(precision_fg)
+        to_background = by_background.mul_(image - background).mul_(precision_bg)
         to_image = -(to_objects.sum(1) + to_background) if ctx.needs_input_grad[0] else None
         return to_image, to_log_objects, to_objects, to_log_background, to_background, None, None
 

@@ -68,24 +68,26 @@ class _Claim(torch.autograd.Function):
     """tanh(softplus(x)) times rows and columns, with its gradient written by hand.
 
     A step does this for every cell of every frame at full resolution: plain autograd keeps five tensors of that size,
-    this keeps two.
+    this keeps the cover and its result, which p_context keeps anyway.
     """
 
     @staticmethod
     def forward(ctx: Any, warped: Tensor, rows: Tensor, columns: Tensor) -> Tensor:  # type: ignore[override]
         cover = F.softplus(warped).tanh_()
-        ctx.save_for_backward(warped, cover, rows, columns)
-        return (cover * rows[..., :, None]).mul_(columns[..., None, :])
+        claims = (cover * rows[..., :, None]).mul_(columns[..., None, :])
+        ctx.save_for_backward(cover, claims, rows, columns)
+        return claims
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
-        warped, cover, rows, columns = ctx.saved_tensors
+        cover, claims, rows, columns = ctx.saved_tensors
         to_inside = grad * cover
         to_rows = (to_inside @ columns[..., :, None]).squeeze(-1)
         to_columns = (rows[..., None, :] @ to_inside).squeeze(-2)
-        to_warped = (grad * rows[..., :, None]).mul_(columns[..., None, :])
-        to_warped.addcmul_(to_warped * cover, cover, value=-1)  # tanh' = 1 - tanh^2
-        return to_warped.mul_(torch.sigmoid(warped)), to_rows, to_columns
+        # With c = tanh(softplus(x)): dc/dx = (1 - c^2) sigmoid(x), and sigmoid(x) = 2 c / (1 + c + sqrt(1 - c^2)).
+        rest = cover.square().neg_().add_(1)
+        below = torch.sqrt(rest, out=to_inside).add_(cover).add_(1)
+        return rest.mul_(claims).mul_(grad).div_(below).mul_(2), to_rows, to_columns
 
 
 class ApexNormalisation(MaskNormalisation):
@@ -149,14 +151,15 @@ class ApexNormalisation(MaskNormalisation):
         nothing = ~valid.any(-1)[..., None, None]
         # A common shift changes no share, but logits of 3 c would cost the float32 sum of the masks its sixth decimal.
         logit = logit - logit.detach().amax(-3).masked_fill(nothing, 0.0)[..., None, :, :]
-        log_norm = torch.logsumexp(logit, dim=-3).masked_fill(nothing, 0.0)
-        log_share = logit - log_norm[..., None, :, :]  # Eq. 10
+        weight = logit.exp()
+        total = weight.sum(-3).masked_fill(nothing, 1.0)[..., None, :, :]
+        share, log_share = weight / total, logit - total.log()  # Eq. 10
         foreground = torch.tanh(s)  # Eq. 8
         # Exactly nothing where no window reaches: a floor there would let a component's empty surroundings, which are
         # black, explain dark pixels that the background misses.
         log_foreground = torch.log(torch.tanh(s.clamp_min(TINY))).masked_fill(s < TINY, -torch.inf)
         return Masks(
-            objects=log_share.exp() * foreground[..., None, :, :],  # Eq. 11
+            objects=share * foreground[..., None, :, :],  # Eq. 11
             log_objects=log_share + log_foreground[..., None, :, :],
             foreground=foreground,
             background=2 * torch.sigmoid(-2 * s),  # Eq. 12: 1 - tanh(s), without cancellation

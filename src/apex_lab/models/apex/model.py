@@ -14,7 +14,7 @@ from apex_lab.models.apex.encoder import ApexEncoder
 from apex_lab.models.apex.glimpses import Glimpses
 from apex_lab.models.apex.likelihood import Likelihood, MixtureLikelihood
 from apex_lab.models.apex.masks import MaskNormalisation, Masks
-from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, mask_entropy
+from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms
 from apex_lab.models.apex.objects import (
     Appearance,
     Discovery,
@@ -25,11 +25,13 @@ from apex_lab.models.apex.objects import (
     sample_presence,
     scope_in_windows,
 )
+from apex_lab.models.apex.result import Drawn, Picture, paint, scene_of, video_of
 from apex_lab.models.apex.rollout import Frame, Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import carry, gather_slots
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
 from apex_lab.nn.distributions import kl_gaussian
+from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.scene import ABSENT, Scene, SceneModel, Schedule
 
@@ -37,7 +39,6 @@ Count = Annotated[int, Field(gt=0)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 Positive = Annotated[float, Field(gt=0)]
 
-BACKGROUND_ID = 0
 FIRST_ID = 1
 
 
@@ -194,11 +195,7 @@ class Apex(SceneModel):
         valid = torch.zeros(b, slots, dtype=torch.bool, device=look_at.device)
         ids = torch.full((b, slots), ABSENT, device=look_at.device)
         next_id = torch.full((b,), FIRST_ID, device=look_at.device)
-        # Masks of all proposals of all frames, before the loop: only the scope they are held against depends on it.
-        alphas = self._alpha(proposals.what)
-        paster = self._paster(proposals.place, alphas.shape[-1])
-        claims = self.masks.claim(alphas, paster)
-        frames = frames_of(look_at, follow_in, proposals, alphas, claims, *paster.inside())
+        frames = frames_of(look_at, follow_in, proposals, self._alpha(proposals.what))
         carried_on = torch.zeros(b, 1, dtype=torch.bool, device=look_at.device)
         steps = []
         for frame in frames:
@@ -216,9 +213,10 @@ class Apex(SceneModel):
             scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
 
             open_ = self._may_discover(carried_on, schedule).to(scope.dtype)
-            prob = frame.prob * context_probability(scope, frame.claims) * open_  # Eq. 17
+            context, unexplained = self._context(frame, scope)
+            prob = frame.prob * context * open_  # Eq. 17
             # Eq. 6: the prior of a discovery's presence, given the propagated objects
-            prior = schedule["discovery_presence"] * scope_in_windows(scope, frame.rows, frame.columns) * open_
+            prior = schedule["discovery_presence"] * unexplained * open_
             pres = sample_presence(prob, schedule["temperature"], self.training) * open_
             top = prob.detach().topk(self.render_top, dim=1).indices
             found = self._found(frame, pres, top)
@@ -247,6 +245,17 @@ class Apex(SceneModel):
             carried_on = self._carried_on(b, schedule)
             valid = kept.valid & carried_on
         return stack_steps(steps)
+
+    def _context(self, cells: Frame, scope: Float[Tensor, "B H W"]) -> tuple[Tensor, Tensor]:
+        """p_context of all cells, and the share of their windows that is not explained yet, each (B, D)."""
+        size = part_size(len(scope), scope[0].numel() * cells.place.shape[1], scope)
+        found = []
+        for alpha, place, left in zip(*(x.split(size) for x in (cells.alpha, cells.place, scope)), strict=True):
+            paster = self._paster(place, alpha.shape[-1])
+            context = context_probability(left, self.masks.claim(alpha, paster))
+            found.append((context, scope_in_windows(left, *paster.inside())))
+        contexts, shares = zip(*found, strict=True)
+        return joined(contexts), joined(shares)
 
     def _carried_on(self, batch: int, schedule: Schedule) -> Tensor:
         """Which videos carry their objects into the next frame, (B, 1); all in evaluation.
@@ -284,32 +293,33 @@ class Apex(SceneModel):
         )
 
     def _explain(self, video: Tensor, proposals: Proposals, steps: Step, schedule: Schedule) -> Scene:
-        """Rendering, likelihood, KL and the result, for all frames at once."""
+        """Rendering, likelihood, KL and the result; no frame waits for another, so a GPU does all at once."""
         b, t = video.shape[:2]
-        paster = self._paster(steps.place, steps.alpha.shape[-1])
-        masks = self.masks.compose(steps.alpha, steps.presence, steps.valid, paster)
-        colours = torch.sigmoid(self.colour_decoder(steps.what.flatten(0, 2))).unflatten(0, steps.presence.shape)
-        means = paster.each(colours)  # (B, T, R, 3, H, W)
+        images = video.flatten(0, 1)
+        drawn = (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)
+        size = part_size(b * t, 3 * self.image_size**2 * steps.presence.shape[-1], video)
+        parts = [Drawn(*part) for part in zip(*(x.flatten(0, 1).split(size) for x in drawn), strict=True)]
+        pasters = [self._paster(part.place, part.alpha.shape[-1]) for part in parts]
+        masks = [
+            self.masks.compose(part.alpha, part.presence, part.valid, paster)
+            for part, paster in zip(parts, pasters, strict=True)
+        ]
 
-        q_background = self.background.posterior(masks.background.flatten(0, 1), video.flatten(0, 1))
+        q_background = self.background.posterior(joined(m.background for m in masks), images)
         z_background = q_background.sample(self.training)
         backdrop = self.background.decode(z_background)
         p_background = self.background.prior(z_background.unflatten(0, (b, t)))
         kl_background = kl_gaussian(type(q_background)(*(x.unflatten(0, (b, t)) for x in q_background)), p_background)
 
-        log_likelihood = self.likelihood(
-            video.flatten(0, 1),
-            masks.log_objects.flatten(0, 1),
-            means.flatten(0, 1),
-            masks.log_background.flatten(0, 1),
-            backdrop,
-            schedule["sigma_fg_scale"],
-            schedule["sigma_bg_scale"],
-        )
+        pictures = [
+            self._picture(*part, schedule)
+            for part in zip(images.split(size), parts, pasters, masks, backdrop.split(size), strict=True)
+        ]
+        picture = video_of(pictures, b)
         slots = self.max_objects
         terms = {
             # Eq. 19, and below the three factors of Eq. 4 as KL terms of Eq. 20; with the mask entropy, Eq. 22
-            "nll": -log_likelihood.unflatten(0, (b, t)).sum(1),
+            "nll": -picture.log_likelihood.sum(1),
             **kl_terms(
                 steps.propagated,
                 steps.alive,
@@ -322,49 +332,23 @@ class Apex(SceneModel):
                 self.direction,
             ),
             "kl_background": kl_background.sum(1),
-            "mask_entropy": mask_entropy(masks).sum(1),
+            "mask_entropy": picture.mask_entropy.sum(1),
         }
-        return self._scene(steps, masks, means, backdrop.unflatten(0, (b, t)), terms)
+        return scene_of(steps, picture, terms)
 
-    @staticmethod
-    def _shares(objects: Float[Tensor, "B T P H W"], at_most: int = 5) -> list[Tensor]:
-        """Mean share of pixels of the largest, second largest, ... object of a frame."""
-        ranked = objects.mean((-2, -1)).sort(dim=-1, descending=True).values.mean((0, 1))
-        return list(ranked[:at_most].unbind())
-
-    def _scene(self, steps: Step, masks: Masks, means: Tensor, backdrop: Tensor, terms: dict[str, Tensor]) -> Scene:
-        """The P objects carried on and the background, last. Pixels of objects that were dropped become background."""
-        b, t = steps.source.shape[:2]
-        flat = steps.source.flatten(0, 1)
-
-        def held(values: Tensor) -> Tensor:
-            return gather_slots(values.flatten(0, 1), flat).unflatten(0, (b, t))
-
-        carried = steps.carried
-        objects = held(masks.objects) * carried[..., None, None]
-        presence = held(steps.presence) * carried
-        window = window_of(held(steps.place)).masked_fill(~carried[..., None], torch.nan)
-        what = held(steps.what) * carried[..., None]
-        blend = (masks.objects[..., None, :, :] * means).sum(2) + masks.background[..., None, :, :] * backdrop
-        live = carried.sum(-1).clamp_min(1)
-        kept = (steps.alive * steps.propagated.q_pres).sum() / steps.alive.sum().clamp_min(1)
-        return Scene(
-            masks=torch.cat([objects, (1 - objects.sum(2, keepdim=True)).clamp_min(0)], dim=2),
-            background=torch.arange(self.max_objects + 1, device=carried.device) == self.max_objects,
-            ids=torch.cat([steps.ids, torch.full_like(steps.ids[..., :1], BACKGROUND_ID)], dim=-1),
-            presence=torch.cat([presence, torch.ones_like(presence[..., :1])], dim=-1),
-            appearance=torch.cat([what, torch.zeros_like(what[..., :1, :])], dim=2),
-            reconstruction=blend,
-            terms=terms,
-            windows=torch.cat([window, torch.full_like(window[..., :1, :], torch.nan)], dim=2),
-            means=None if self.training else torch.cat([held(means), backdrop[:, :, None]], dim=2),
-            diagnostics={
-                **{f"share_{i}": share for i, share in enumerate(self._shares(objects))},
-                "live_objects": carried.float().sum(-1).mean(),
-                "foreground": masks.foreground.mean(),
-                "window_size": (window[..., :2].mean(-1).nan_to_num().sum(-1) / live).mean(),
-                "discovery_prob": steps.discovery_prob.mean(),
-                "propagated_prob": kept,
-                "propagated_share": (carried & (steps.source < self.max_objects)).sum() / carried.sum().clamp_min(1),
-            },
+    def _picture(
+        self, image: Tensor, part: Drawn, paster: Paster, masks: Masks, backdrop: Tensor, schedule: Schedule
+    ) -> Picture:
+        """Appearance, likelihood and mask entropy of N frames whose masks are known."""
+        colours = torch.sigmoid(self.colour_decoder(part.what.flatten(0, 1))).unflatten(0, part.presence.shape)
+        means = paster.each(colours)  # (N, R, 3, H, W)
+        log_likelihood = self.likelihood(
+            image,
+            masks.log_objects,
+            means,
+            masks.log_background,
+            backdrop,
+            schedule["sigma_fg_scale"],
+            schedule["sigma_bg_scale"],
         )
+        return paint(masks, means, backdrop, log_likelihood, keep_means=not self.training)

@@ -16,8 +16,7 @@ class Frame(NamedTuple):
 
     look_at, follow_in (B, C, h, w): what glimpses and propagation crops are cut from.
     what (B, D, Z), place (B, D, 4), prob (B, D), hidden_what (B, D, hidden): proposals, as in `Proposals`.
-    alpha (B, D, g, g): their mask logits; claims (B, D, H, W): what each would cover on its own.
-    rows (B, D, H), columns (B, D, W): how far image rows and columns lie inside the proposed windows.
+    alpha (B, D, g, g): their mask logits.
     """
 
     look_at: Tensor
@@ -27,28 +26,15 @@ class Frame(NamedTuple):
     prob: Tensor
     hidden_what: Tensor
     alpha: Tensor
-    claims: Tensor
-    rows: Tensor
-    columns: Tensor
 
 
-def frames_of(
-    look_at: Tensor,
-    follow_in: Tensor,
-    proposals: Proposals,
-    alphas: Tensor,
-    claims: Tensor,
-    rows: Tensor,
-    columns: Tensor,
-) -> list[Frame]:
+def frames_of(look_at: Tensor, follow_in: Tensor, proposals: Proposals, alphas: Tensor) -> list[Frame]:
     """Video -> frames: takes dimension 1 of everything apart, as in `Frame`.
 
     All at once, because autograd fills a tensor of the size of the whole video for every slice that is taken alone.
     """
-    fields = (look_at, follow_in, proposals.what, proposals.place, proposals.prob, proposals.hidden_what)
-    return [
-        Frame(*values) for values in zip(*(x.unbind(1) for x in (*fields, alphas, claims, rows, columns)), strict=True)
-    ]
+    fields = (look_at, follow_in, proposals.what, proposals.place, proposals.prob, proposals.hidden_what, alphas)
+    return [Frame(*values) for values in zip(*(x.unbind(1) for x in fields), strict=True)]
 
 
 class Step(NamedTuple):

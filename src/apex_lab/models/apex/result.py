@@ -1,0 +1,130 @@
+"""What APEX says about a video: pictures of its frames, and the `Scene` of the objects that are carried on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from apex_lab.models.apex.masks import Masks
+from apex_lab.models.apex.objective import mask_entropy
+from apex_lab.models.apex.rollout import Step
+from apex_lab.models.apex.slots import gather_slots
+from apex_lab.models.apex.windows import window_of
+from apex_lab.nn.parts import joined
+from apex_lab.scene import Scene
+
+BACKGROUND_ID = 0
+
+
+class Drawn(NamedTuple):
+    """What N frames are drawn from: fields of `Step` of R components."""
+
+    alpha: Float[Tensor, "N R g g"]
+    presence: Float[Tensor, "N R"]
+    valid: Bool[Tensor, "N R"]
+    place: Float[Tensor, "N R 4"]
+    what: Float[Tensor, "N R Z"]
+
+
+class Picture(NamedTuple):
+    """N frames as they are drawn; of a whole video with dimensions (B, T) in place of N.
+
+    objects (N, R, H, W): masks; foreground (N, H, W): m_fg; reconstruction (N, 3, H, W): RGB in [0, 1].
+    log_likelihood, mask_entropy (N,): nats.
+    backdrop (N, 3, H, W): the background's picture; means (N, R, 3, H, W): the objects' pictures, None in training.
+    """
+
+    objects: Tensor
+    foreground: Tensor
+    reconstruction: Tensor
+    log_likelihood: Tensor
+    mask_entropy: Tensor
+    backdrop: Tensor
+    means: Tensor | None
+
+
+def paint(masks: Masks, means: Tensor, backdrop: Tensor, log_likelihood: Tensor, keep_means: bool) -> Picture:
+    """Draws N frames from their masks of R components.
+
+    Args:
+        masks: of (N, R, H, W).
+        means: (N, R, 3, H, W), RGB in [0, 1].
+        backdrop: (N, 3, H, W), RGB in [0, 1].
+        log_likelihood: (N,), nats.
+        keep_means: whether they are told.
+    """
+    blend = (masks.objects[:, :, None] * means).sum(1) + masks.background[:, None] * backdrop
+    return Picture(
+        masks.objects,
+        masks.foreground,
+        blend,
+        log_likelihood,
+        mask_entropy(masks),
+        backdrop,
+        means if keep_means else None,
+    )
+
+
+def video_of(pictures: Sequence[Picture], batch: int) -> Picture:
+    """Pictures of parts of `batch` videos, all of whose frames are in order -> dimensions (B, T) in place of N."""
+
+    def whole(name: str) -> Tensor:
+        return joined(getattr(picture, name) for picture in pictures).unflatten(0, (batch, -1))
+
+    return Picture(
+        whole("objects"),
+        whole("foreground"),
+        whole("reconstruction"),
+        whole("log_likelihood"),
+        whole("mask_entropy"),
+        whole("backdrop"),
+        None if pictures[0].means is None else whole("means"),
+    )
+
+
+def _shares(objects: Float[Tensor, "B T P H W"], at_most: int = 5) -> list[Tensor]:
+    """Mean share of pixels of the largest, second largest, ... object of a frame."""
+    ranked = objects.mean((-2, -1)).sort(dim=-1, descending=True).values.mean((0, 1))
+    return list(ranked[:at_most].unbind())
+
+
+def scene_of(steps: Step, picture: Picture, terms: dict[str, Tensor]) -> Scene:
+    """The P objects carried on and the background, last. Pixels of objects that were dropped become background."""
+    b, t, slots = steps.source.shape
+    flat = steps.source.flatten(0, 1)
+
+    def held(values: Tensor) -> Tensor:
+        return gather_slots(values.flatten(0, 1), flat).unflatten(0, (b, t))
+
+    carried = steps.carried
+    objects = held(picture.objects) * carried[..., None, None]
+    presence = held(steps.presence) * carried
+    window = window_of(held(steps.place)).masked_fill(~carried[..., None], torch.nan)
+    what = held(steps.what) * carried[..., None]
+    live = carried.sum(-1).clamp_min(1)
+    kept = (steps.alive * steps.propagated.q_pres).sum() / steps.alive.sum().clamp_min(1)
+    means = picture.means
+    return Scene(
+        masks=torch.cat([objects, (1 - objects.sum(2, keepdim=True)).clamp_min(0)], dim=2),
+        background=torch.arange(slots + 1, device=carried.device) == slots,
+        ids=torch.cat([steps.ids, torch.full_like(steps.ids[..., :1], BACKGROUND_ID)], dim=-1),
+        presence=torch.cat([presence, torch.ones_like(presence[..., :1])], dim=-1),
+        appearance=torch.cat([what, torch.zeros_like(what[..., :1, :])], dim=2),
+        reconstruction=picture.reconstruction,
+        terms=terms,
+        windows=torch.cat([window, torch.full_like(window[..., :1, :], torch.nan)], dim=2),
+        means=None if means is None else torch.cat([held(means), picture.backdrop[:, :, None]], dim=2),
+        diagnostics={
+            **{f"share_{i}": share for i, share in enumerate(_shares(objects))},
+            "live_objects": carried.float().sum(-1).mean(),
+            "foreground": picture.foreground.mean(),
+            "window_size": (window[..., :2].mean(-1).nan_to_num().sum(-1) / live).mean(),
+            "discovery_prob": steps.discovery_prob.mean(),
+            "propagated_prob": kept,
+            "propagated_share": (carried & (steps.source < slots)).sum() / carried.sum().clamp_min(1),
+        },
+    )
