@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -19,7 +20,7 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from apex_lab import bench
-from apex_lab.benchmark import child, report
+from apex_lab.benchmark import child, compare, report
 from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.parts import PARTS
 from apex_lab.benchmark.work import Workload
@@ -34,6 +35,13 @@ HERE = torch.device("cpu")
 
 def workload(*words: str, device: torch.device = HERE) -> Workload:
     return Workload(compose_job(*APEX[:3], *words).config, device, 2, 3)
+
+
+@contextlib.contextmanager
+def in_the_same_process(asked: compare.Comparison, name: str) -> Iterator[Callable[[], tuple[float, float]]]:
+    """As `compare.own_process`, without the seconds that a process takes to begin."""
+    with torch.random.fork_rng(devices=[]):
+        yield compare.timed_step(compare.workload(asked, name))
 
 
 def in_this_process(work: Callable[[Any], Any], asked: Any) -> Any:
@@ -186,6 +194,7 @@ def test_writes_a_file_with_every_row(
     command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bench, "in_child", in_this_process)
+    monkeypatch.setattr(compare, "own_process", in_the_same_process)
     ended = command("bench", *APEX, "trainer.compile=false", "bench.repeats=2", "bench.output=out/speed.json")
     assert ended.code == 0, ended.err
     told = json.loads((tmp_path / "out" / "speed.json").read_text())
@@ -209,6 +218,7 @@ def test_any_model_can_be_measured(
     command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bench, "in_child", in_this_process)
+    monkeypatch.setattr(compare, "own_process", in_the_same_process)
     words = ("trainer=cpu", "trainer.compile=false", "bench.repeats=1")
     assert command("bench", *TINY, *words).code == 0
     assert command("bench", "model=color_clusters", "scale=smoke", *words).code == 0
@@ -271,6 +281,20 @@ def test_a_child_that_dies_is_told() -> None:
         child.in_child(kill_this_process, None)
     with pytest.raises(UserError, match=r"^No\.$"):
         child.in_child(refuse_in_child, None)
+
+
+@pytest.mark.slow
+def test_a_model_steps_in_its_own_process_and_its_death_is_told() -> None:
+    job = compose_job(*APEX)
+    asked = compare.Comparison(check_job(job.raw, job.choices).config, "cpu", 1, 2, 0, 1)
+    with compare.own_process(asked, compare.STRAIGHTFORWARD) as step:
+        passed, _ = step()
+        assert 0 < passed < 60
+        [worker] = multiprocessing.active_children()
+        assert worker.pid is not None
+        os.kill(worker.pid, signal.SIGKILL)
+        with pytest.raises(UserError, match="that measured straightforward ended, as happens when memory runs out"):
+            step()
 
 
 @pytest.mark.slow

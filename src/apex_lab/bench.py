@@ -149,7 +149,7 @@ def bench(asked: Bench) -> None:
     if asked.asked.compare and isinstance(build_model(config), Apex):
         for device in devices:
             settings = Comparison(config, device, *asked.batch(device), asked.asked.warmup, asked.asked.repeats)
-            result["comparisons"].append(in_child(compare, settings))
+            result["comparisons"].append(compare(settings))
             console.say(report.comparison(result["comparisons"][-1]))
     for table in report.tables(result["rows"]):
         console.say(table)

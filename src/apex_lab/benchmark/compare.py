@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
+import multiprocessing
+import signal
 import statistics
 import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 
@@ -15,10 +21,15 @@ from apex_lab.benchmark.measure import once, spread
 from apex_lab.benchmark.straightforward import Straightforward
 from apex_lab.benchmark.work import Workload
 from apex_lab.config import Config
+from apex_lab.errors import UserError
 from apex_lab.models.apex import Apex
+
+APEX = "apex"
+T = TypeVar("T")
 
 STRAIGHTFORWARD = "straightforward"
 RENDERS_AS_MANY = "straightforward, renders as many"
+NAMES = (APEX, STRAIGHTFORWARD, RENDERS_AS_MANY)
 
 
 @dataclass(frozen=True)
@@ -56,35 +67,87 @@ def straightforward(config: Config, model: Apex, render_top: int | None) -> Stra
     return variant
 
 
+def workload(asked: Comparison, name: str) -> Workload:
+    """One of the three models of a comparison, with its batch and its optimiser."""
+    device = torch.device(asked.device)
+    work = Workload(asked.config, device, asked.batch_size, asked.frames)
+    assert isinstance(work.model, Apex)
+    if name == APEX:
+        return work
+    variant = straightforward(asked.config, work.model, None if name == STRAIGHTFORWARD else work.model.render_top)
+    return Workload(asked.config, device, asked.batch_size, asked.frames, variant)
+
+
+def _begin(asked: Comparison, name: str) -> None:
+    global _timed_step
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
+    _timed_step = timed_step(workload(asked, name))
+
+
+def timed_step(work: Workload) -> Callable[[], tuple[float, float]]:
+    """A function that makes one training step and tells its seconds, and those of the processor."""
+    step = work.step(training=True)
+
+    def timed() -> tuple[float, float]:
+        began = time.process_time()
+        passed = once(step, work.device)
+        return passed, time.process_time() - began
+
+    return timed
+
+
+_timed_step: Callable[[], tuple[float, float]]
+"""What a process of `own_process` was made for."""
+
+
+def _run() -> tuple[float, float]:
+    return _timed_step()
+
+
+@contextlib.contextmanager
+def own_process(asked: Comparison, name: str) -> Iterator[Callable[[], tuple[float, float]]]:
+    """`timed_step` of one of the models, made in a process that does nothing else.
+
+    Raises:
+        UserError: the process was ended, as happens when memory runs out.
+    """
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+
+        def there(work: Callable[..., T], *args: object) -> T:
+            try:
+                return process.submit(work, *args).result()
+            except BrokenProcessPool as error:
+                raise UserError(
+                    f"The process that measured {name} ended, as happens when memory runs out: lower "
+                    "bench.cpu_videos, data.batch_size, data.frames or data.image_size, or set bench.compare=false."
+                ) from error
+
+        there(_begin, asked, name)
+        yield lambda: there(_run)
+
+
 def compare(asked: Comparison) -> dict[str, Any]:
     """Frames per second of APEX and of both variants, and the ratios, round by round.
 
-    On the CPU the ratios are told once more in processor time, which other programs on the machine disturb less.
+    Each model has a process of its own, as in a training, so that none works in memory that another has left behind;
+    they make their steps in turns, so that whatever else the machine does meets them alike. On the CPU the ratios are
+    told once more in processor time.
+
+    Raises:
+        UserError: memory ran out.
     """
-    device = torch.device(asked.device)
-
-    def work(model: Apex | None) -> Workload:
-        return Workload(asked.config, device, asked.batch_size, asked.frames, model)
-
-    fast = work(None)
-    assert isinstance(fast.model, Apex)
-    works = {
-        "apex": fast,
-        STRAIGHTFORWARD: work(straightforward(asked.config, fast.model, None)),
-        RENDERS_AS_MANY: work(straightforward(asked.config, fast.model, fast.model.render_top)),
-    }
-    steps = {name: each.step(training=True) for name, each in works.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in works}
-    processor: dict[str, list[float]] = {name: [] for name in works}
-    with torch.random.fork_rng(devices=[]):
+    seconds: dict[str, list[float]] = {name: [] for name in NAMES}
+    processor: dict[str, list[float]] = {name: [] for name in NAMES}
+    with contextlib.ExitStack() as stack:
+        steps = {name: stack.enter_context(own_process(asked, name)) for name in NAMES}
         for i in range(asked.warmup + asked.repeats):
             for name, step in steps.items():
-                began = time.process_time()
-                passed = once(step, device)
+                passed, worked = step()
                 if i >= asked.warmup:
                     seconds[name].append(passed)
-                    processor[name].append(time.process_time() - began)
-    ratios, in_processor_time = ({n: _ratios(times["apex"], times[n]) for n in works} for times in (seconds, processor))
+                    processor[name].append(worked)
+    ratios, in_processor_time = ({n: _ratios(times[APEX], times[n]) for n in NAMES} for times in (seconds, processor))
+    frames = asked.batch_size * asked.frames
     return {
         "device": asked.device,
         "batch_size": asked.batch_size,
@@ -92,7 +155,7 @@ def compare(asked: Comparison) -> dict[str, Any]:
         "rounds": asked.repeats,
         "models": {
             name: {
-                **spread(seconds[name], fast.frames),
+                **spread(seconds[name], frames),
                 "apex_trains_times_as_many": statistics.median(ratios[name]),
                 "times_min_max": [min(ratios[name]), max(ratios[name])],
                 "times_in_processor_time": statistics.median(in_processor_time[name])
@@ -100,7 +163,7 @@ def compare(asked: Comparison) -> dict[str, Any]:
                 else None,
                 "processor_seconds": statistics.median(processor[name]),
             }
-            for name in works
+            for name in NAMES
         },
     }
 
