@@ -7,6 +7,7 @@ from abc import ABC, abstractmethod
 from typing import Annotated, Any, Literal
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
@@ -18,6 +19,15 @@ def log_normal(x: Tensor, mean: Tensor, sigma: float | Tensor) -> Tensor:
     """log N(x; mean, sigma^2), elementwise; nats."""
     log_sigma = sigma.log() if isinstance(sigma, Tensor) else math.log(sigma)
     return -0.5 * ((x - mean) / sigma).square() - log_sigma - 0.5 * math.log(2 * math.pi)
+
+
+NEGLIGIBLE = -80.0
+"""Log of a share that no float32 sum of shares can tell from zero."""
+
+
+def _exp_(x: Tensor) -> Tensor:
+    """exp in place; below `NEGLIGIBLE` exactly zero, where CPUs take ten times as long for numbers that underflow."""
+    return F.threshold_(x.clamp_min_(NEGLIGIBLE).exp_(), 1.001 * math.exp(NEGLIGIBLE), 0.0)
 
 
 class _LogMixture(torch.autograd.Function):
@@ -44,8 +54,8 @@ class _LogMixture(torch.autograd.Function):
         by_background = (image - background).square_().mul_(-0.5 / sigma_bg**2)
         by_background += (log_background - sigma_bg.log())[:, None]
         highest = torch.maximum(by_object.amax(1), by_background)
-        shares = by_object.sub_(highest[:, None]).exp_()
-        share_background = by_background.sub_(highest).exp_()
+        shares = _exp_(by_object.sub_(highest[:, None]))
+        share_background = _exp_(by_background.sub_(highest))
         total = shares.sum(1) + share_background
         shares /= total[:, None]
         share_background /= total

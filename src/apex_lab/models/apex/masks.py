@@ -73,7 +73,10 @@ class _Claim(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, warped: Tensor, rows: Tensor, columns: Tensor) -> Tensor:  # type: ignore[override]
-        cover = F.softplus(warped).tanh_()
+        # tanh(softplus(x)) = n / (n + 2) with n = e^x (e^x + 2): one exponential, no logarithm
+        power = warped.exp()
+        cover = power.add(2).mul_(power)
+        cover.div_(torch.add(cover, 2, out=power))
         claims = (cover * rows[..., :, None]).mul_(columns[..., None, :])
         ctx.save_for_backward(cover, claims, rows, columns)
         return claims
@@ -94,12 +97,14 @@ class ApexNormalisation(MaskNormalisation):
     """APEX's mask normalisation, in log space throughout (Eq. 7-12).
 
     Args:
-        c: bounds the mask logits to [-c, c] (Eq. 7).
+        c: bounds the mask logits to [-c, c] (Eq. 7); up to 40, since float32 holds no e^(2 c) beyond.
         outside: what a present component's logit counts outside its window: `zero` is the literal reading of Eq. 9 (the
             warp pads with zeros), `minus_c` pads with the weakest logit.
     """
 
-    def __init__(self, c: Annotated[float, Field(gt=0)] = 5.0, outside: Literal["zero", "minus_c"] = "zero") -> None:
+    def __init__(
+        self, c: Annotated[float, Field(gt=0, le=40)] = 5.0, outside: Literal["zero", "minus_c"] = "zero"
+    ) -> None:
         self.c, self.outside = c, outside
 
     def logits(self, raw: Float[Tensor, "..."]) -> Float[Tensor, "..."]:

@@ -86,7 +86,5 @@ def kl_terms(
 def mask_entropy(masks: Masks) -> Float[Tensor, "..."]:
     """L_H = sum over pixels and objects of -m_fg m_k log m_k (Eq. 21), per frame (any leading shape)."""
     # x log x -> 0: where a mask underflows (or is -inf, an absent component), its log is replaced before multiplying.
-    nothing = masks.log_objects < -60
-    log_objects = masks.log_objects.masked_fill(nothing, 0.0)
-    objects = log_objects.exp().masked_fill(nothing, 0.0)
-    return -(masks.foreground * (objects * log_objects).sum(-3)).sum((-2, -1))
+    log_objects = masks.log_objects.masked_fill(masks.log_objects < -60, 0.0)
+    return -(masks.foreground * (masks.objects * log_objects).sum(-3)).sum((-2, -1))
