@@ -7,7 +7,6 @@ from abc import ABC, abstractmethod
 from typing import Annotated, Any, Literal
 
 import torch
-import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
@@ -27,7 +26,7 @@ NEGLIGIBLE = -80.0
 
 def _exp_(x: Tensor) -> Tensor:
     """exp in place; below `NEGLIGIBLE` exactly zero, where CPUs take ten times as long for numbers that underflow."""
-    return F.threshold_(x.clamp_min_(NEGLIGIBLE).exp_(), 1.001 * math.exp(NEGLIGIBLE), 0.0)
+    return torch.threshold_(x.clamp_min_(NEGLIGIBLE).exp_(), 1.001 * math.exp(NEGLIGIBLE), 0.0)
 
 
 class _LogMixture(torch.autograd.Function):
