@@ -293,8 +293,12 @@ def test_a_model_steps_in_its_own_process_and_its_death_is_told() -> None:
         [worker] = multiprocessing.active_children()
         assert worker.pid is not None
         os.kill(worker.pid, signal.SIGKILL)
-        with pytest.raises(UserError, match="that measured straightforward ended, as happens when memory runs out"):
+        with pytest.raises(
+            UserError,
+            match="measurement of straightforward was ended by SIGKILL, as happens when memory runs out: lower",
+        ):
             step()
+    assert not multiprocessing.active_children()
 
 
 @pytest.mark.slow

@@ -38,11 +38,12 @@ def orthogonalised(matrix: Float[Tensor, "rows columns"], iterations: int = 5) -
 def all_orthogonalised(matrices: Sequence[Float[Tensor, "_ _"]], iterations: int = 5) -> list[Tensor]:
     """`orthogonalised` of each matrix; those whose smaller side is equally long are iterated together."""
     wide = [m if m.shape[0] <= m.shape[1] else m.T for m in matrices]
-    norms = torch.stack(torch._foreach_norm(wide)).clamp_min(NOTHING)
-    wide = list(torch._foreach_div(wide, list(norms.unbind())))
+    norms = [norm.clamp_min_(NOTHING) for norm in torch._foreach_norm(wide)]
+    wide = list(torch._foreach_div(wide, norms))
     applied: list[Tensor] = list(wide)
-    for side in sorted({len(x) for x in wide}):
-        chosen = [i for i, x in enumerate(wide) if len(x) == side]
+    kinds = [(len(x), x.dtype, x.device) for x in wide]
+    for kind in dict.fromkeys(kinds):
+        chosen = [i for i, other in enumerate(kinds) if other == kind]
         iterated = _newton_schulz(torch.stack([wide[i] @ wide[i].T for i in chosen]), iterations)
         for i, factor in zip(chosen, iterated.unbind(), strict=True):
             applied[i] = factor @ wide[i]

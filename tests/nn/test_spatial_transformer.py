@@ -86,7 +86,7 @@ def test_gradients_by_finite_differences() -> None:
     assert torch.autograd.gradcheck(lambda x, w: paste(x, w, 9), (glimpse, window))
 
 
-def test_the_gradient_of_the_weights_is_that_of_autograd() -> None:
+def test_between_pixel_centres_the_gradient_of_the_weights_is_that_of_autograd() -> None:
     g = torch.Generator().manual_seed(7)
     inside = 12 * torch.rand(200, generator=g, dtype=torch.float64) - 2  # some just outside of 0..7
     far = torch.tensor([-1e6, -2.5, -1.5, 8.5, 9.5, 1e6], dtype=torch.float64)

@@ -9,10 +9,9 @@ import signal
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from multiprocessing.connection import Connection
+from typing import Any
 
 import torch
 
@@ -25,11 +24,10 @@ from apex_lab.errors import UserError
 from apex_lab.models.apex import Apex
 
 APEX = "apex"
-T = TypeVar("T")
-
 STRAIGHTFORWARD = "straightforward"
 RENDERS_AS_MANY = "straightforward, renders as many"
 NAMES = (APEX, STRAIGHTFORWARD, RENDERS_AS_MANY)
+LESS = "lower data.batch_size, data.frames or data.image_size, or leave the comparison out by bench.compare=false."
 
 
 @dataclass(frozen=True)
@@ -78,12 +76,6 @@ def workload(asked: Comparison, name: str) -> Workload:
     return Workload(asked.config, device, asked.batch_size, asked.frames, variant)
 
 
-def _begin(asked: Comparison, name: str) -> None:
-    global _timed_step
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
-    _timed_step = timed_step(workload(asked, name))
-
-
 def timed_step(work: Workload) -> Callable[[], tuple[float, float]]:
     """A function that makes one training step and tells its seconds, and those of the processor."""
     step = work.step(training=True)
@@ -96,12 +88,18 @@ def timed_step(work: Workload) -> Callable[[], tuple[float, float]]:
     return timed
 
 
-_timed_step: Callable[[], tuple[float, float]]
-"""What a process of `own_process` was made for."""
-
-
-def _run() -> tuple[float, float]:
-    return _timed_step()
+def _serve(asked: Comparison, name: str, parent: Connection) -> None:
+    """Makes a step whenever the parent asks for one, and ends with it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
+    step = timed_step(workload(asked, name))
+    try:
+        while True:
+            parent.recv()
+            parent.send(step())
+    except EOFError:
+        return
+    except torch.OutOfMemoryError:
+        parent.send(UserError(f"The GPU's memory does not hold the step of {name}: {LESS}"))
 
 
 @contextlib.contextmanager
@@ -109,21 +107,36 @@ def own_process(asked: Comparison, name: str) -> Iterator[Callable[[], tuple[flo
     """`timed_step` of one of the models, made in a process that does nothing else.
 
     Raises:
-        UserError: the process was ended, as happens when memory runs out.
+        UserError: the process was ended by a signal, as happens when memory runs out, or the GPU's memory did.
+        RuntimeError: the process ended otherwise; its traceback is on stderr.
     """
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+    context = multiprocessing.get_context("spawn")
+    child, childs = context.Pipe()
+    process = context.Process(target=_serve, args=(asked, name, childs), daemon=True)
+    process.start()
+    childs.close()
 
-        def there(work: Callable[..., T], *args: object) -> T:
-            try:
-                return process.submit(work, *args).result()
-            except BrokenProcessPool as error:
+    def step() -> tuple[float, float]:
+        try:
+            child.send(None)
+            told = child.recv()
+        except (EOFError, ConnectionError) as error:
+            process.join()
+            if process.exitcode is not None and process.exitcode < 0:
+                killer = signal.Signals(-process.exitcode).name
                 raise UserError(
-                    f"The process that measured {name} ended, as happens when memory runs out: lower "
-                    "bench.cpu_videos, data.batch_size, data.frames or data.image_size, or set bench.compare=false."
+                    f"The measurement of {name} was ended by {killer}, as happens when memory runs out: {LESS}"
                 ) from error
+            raise RuntimeError(f"the measurement of {name} failed with exit code {process.exitcode}") from error
+        if isinstance(told, UserError):
+            raise told
+        return told
 
-        there(_begin, asked, name)
-        yield lambda: there(_run)
+    try:
+        yield step
+    finally:
+        process.kill()
+        process.join()
 
 
 def compare(asked: Comparison) -> dict[str, Any]:

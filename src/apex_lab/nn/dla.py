@@ -121,7 +121,7 @@ class DLA(nn.Module):
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N F H/4 W/4"]:
         # At full resolution images are many and weights few: in parts.
-        size = part_size(len(images), self.widest * images[0, 0].numel(), images)
+        size = part_size(len(images), self.widest * images.shape[-2:].numel(), images)
         x = joined(self.stem(part) for part in images.split(size))
         maps = []
         for tree in self.trees:

@@ -22,7 +22,9 @@ def part_size(count: int, values_each: int, like: Tensor) -> int:
         values_each: numbers that the largest tensor holds for each.
         like: a tensor of the device and type that they are worked on with.
     """
-    return max(1, min(count, CACHED // (values_each * like.element_size()))) if like.device.type == "cpu" else count
+    if like.device.type != "cpu" or torch.compiler.is_compiling():  # a compiler would unroll the parts
+        return count
+    return max(1, min(count, CACHED // (values_each * like.element_size())))
 
 
 def joined(parts: Iterable[Tensor]) -> Tensor:
