@@ -6,6 +6,7 @@ import multiprocessing
 import signal
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
 from apex_lab.errors import UserError
@@ -29,20 +30,28 @@ def in_child(work: Callable[[Asked], Told], asked: Asked) -> Told:
     try:
         told = receive.recv()
     except EOFError as error:
-        process.join()
-        if process.exitcode is not None and process.exitcode < 0:
-            name = signal.Signals(-process.exitcode).name
-            raise UserError(
-                f"A measurement was ended by {name}, as happens when memory runs out: "
-                "lower data.batch_size, data.frames or data.image_size."
-            ) from error
-        raise RuntimeError(f"a measurement failed with exit code {process.exitcode}") from error
+        raise death(process, "A measurement") from error
     finally:
         process.kill()
         process.join()
     if isinstance(told, UserError):
         raise told
     return told
+
+
+def death(process: BaseProcess, what: str) -> UserError | RuntimeError:
+    """What is to be raised of a process that ended without a result.
+
+    A signal is the user's business, as when memory runs out; else the process has written a traceback to stderr.
+    """
+    process.join()
+    if process.exitcode is not None and process.exitcode < 0:
+        name = signal.Signals(-process.exitcode).name
+        return UserError(
+            f"{what} was ended by {name}, as happens when memory runs out: "
+            "lower data.batch_size, data.frames or data.image_size."
+        )
+    return RuntimeError(f"{what} failed with exit code {process.exitcode}")
 
 
 def _serve(work: Callable[[Asked], Told], asked: Asked, send: Connection) -> None:

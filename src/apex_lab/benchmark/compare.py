@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from apex_lab import components
+from apex_lab.benchmark.child import death
 from apex_lab.benchmark.measure import once, spread
 from apex_lab.benchmark.straightforward import Straightforward
 from apex_lab.benchmark.work import Workload
@@ -27,7 +28,6 @@ APEX = "apex"
 STRAIGHTFORWARD = "straightforward"
 RENDERS_AS_MANY = "straightforward, renders as many"
 NAMES = (APEX, STRAIGHTFORWARD, RENDERS_AS_MANY)
-LESS = "lower data.batch_size, data.frames or data.image_size, or leave the comparison out by bench.compare=false."
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,8 @@ def _serve(asked: Comparison, name: str, parent: Connection) -> None:
     except EOFError:
         return
     except torch.OutOfMemoryError:
-        parent.send(UserError(f"The GPU's memory does not hold the step of {name}: {LESS}"))
+        less = "lower data.batch_size, data.frames or data.image_size, or set bench.compare=false."
+        parent.send(UserError(f"The GPU's memory does not hold the step of {name}: {less}"))
 
 
 @contextlib.contextmanager
@@ -121,13 +122,7 @@ def own_process(asked: Comparison, name: str) -> Iterator[Callable[[], tuple[flo
             child.send(None)
             told = child.recv()
         except (EOFError, ConnectionError) as error:
-            process.join()
-            if process.exitcode is not None and process.exitcode < 0:
-                killer = signal.Signals(-process.exitcode).name
-                raise UserError(
-                    f"The measurement of {name} was ended by {killer}, as happens when memory runs out: {LESS}"
-                ) from error
-            raise RuntimeError(f"the measurement of {name} failed with exit code {process.exitcode}") from error
+            raise death(process, f"The measurement of {name}") from error
         if isinstance(told, UserError):
             raise told
         return told

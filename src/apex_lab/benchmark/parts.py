@@ -14,7 +14,6 @@ from typing import Any
 import torch
 
 import apex_lab.models.apex.model as apex
-import apex_lab.models.apex.result as result
 from apex_lab.models.apex import Apex
 from apex_lab.scene import SceneModel
 
@@ -114,7 +113,7 @@ def _entries(model: Apex) -> list[tuple[Any, str, str]]:
         (model, "likelihood", "likelihood"),
         (apex, "kl_terms", "other terms"),
         (apex, "kl_gaussian", "other terms"),
-        (result, "mask_entropy", "other terms"),
+        (apex, "mask_entropy", "other terms"),
         (apex, "scene_of", REST),
     ]
 

@@ -88,9 +88,7 @@ def test_the_configuration_differs_in_the_swapped_part_only(name: str, scale: st
     base, other = flat(resolved(*words)), flat(resolved(*words, f"+ablation={name}"))
     absent = object()
     differ = {key for key in base.keys() | other.keys() if base.get(key, absent) != other.get(key, absent)}
-    # a crop of the image takes more pixels than one of the feature map to show as much
-    finer = {"model.glimpses.size"} if (name, scale) == ("image_stn", "paper") else set()
-    assert differ == SWAPS[name] | finer
+    assert differ == SWAPS[name]
 
 
 @pytest.mark.parametrize("name", SWAPS)

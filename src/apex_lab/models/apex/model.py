@@ -14,7 +14,7 @@ from apex_lab.models.apex.encoder import ApexEncoder
 from apex_lab.models.apex.glimpses import Glimpses
 from apex_lab.models.apex.likelihood import Likelihood, MixtureLikelihood
 from apex_lab.models.apex.masks import MaskNormalisation, Masks
-from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms
+from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, mask_entropy
 from apex_lab.models.apex.objects import (
     Appearance,
     Discovery,
@@ -25,7 +25,7 @@ from apex_lab.models.apex.objects import (
     sample_presence,
     scope_in_windows,
 )
-from apex_lab.models.apex.result import Drawn, Picture, paint, scene_of, video_of
+from apex_lab.models.apex.result import Drawn, Picture, scene_of, video_of
 from apex_lab.models.apex.rollout import Frame, Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import carry, gather_slots
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
@@ -351,4 +351,12 @@ class Apex(SceneModel):
             schedule["sigma_fg_scale"],
             schedule["sigma_bg_scale"],
         )
-        return paint(masks, means, backdrop, log_likelihood, keep_means=not self.training)
+        return Picture(
+            masks.objects,
+            masks.foreground,
+            (masks.objects[:, :, None] * means).sum(1) + masks.background[:, None] * backdrop,
+            log_likelihood,
+            mask_entropy(masks),
+            backdrop,
+            None if self.training else means,
+        )

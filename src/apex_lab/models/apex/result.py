@@ -9,8 +9,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from apex_lab.models.apex.masks import Masks
-from apex_lab.models.apex.objective import mask_entropy
 from apex_lab.models.apex.rollout import Step
 from apex_lab.models.apex.slots import gather_slots
 from apex_lab.models.apex.windows import window_of
@@ -45,28 +43,6 @@ class Picture(NamedTuple):
     mask_entropy: Tensor
     backdrop: Tensor
     means: Tensor | None
-
-
-def paint(masks: Masks, means: Tensor, backdrop: Tensor, log_likelihood: Tensor, keep_means: bool) -> Picture:
-    """Draws N frames from their masks of R components.
-
-    Args:
-        masks: of (N, R, H, W).
-        means: (N, R, 3, H, W), RGB in [0, 1].
-        backdrop: (N, 3, H, W), RGB in [0, 1].
-        log_likelihood: (N,), nats.
-        keep_means: whether they are told.
-    """
-    blend = (masks.objects[:, :, None] * means).sum(1) + masks.background[:, None] * backdrop
-    return Picture(
-        masks.objects,
-        masks.foreground,
-        blend,
-        log_likelihood,
-        mask_entropy(masks),
-        backdrop,
-        means if keep_means else None,
-    )
 
 
 def video_of(pictures: Sequence[Picture], batch: int) -> Picture:
