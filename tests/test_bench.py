@@ -20,12 +20,12 @@ from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from apex_lab import bench
+from apex_lab.base.errors import UserError
 from apex_lab.benchmark import child, compare, report
 from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.parts import PARTS
 from apex_lab.benchmark.work import Workload
 from apex_lab.config import check_job
-from apex_lab.errors import UserError
 from apex_lab.optimizers import Muon
 from tests.conftest import TINY, Ended, compose_job
 

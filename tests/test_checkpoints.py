@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from apex_lab import checkpoints
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 
 
 def content(step: int = 3) -> dict[str, Any]:

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
+from apex_lab.base.errors import UserError
 from apex_lab.components import build, check
-from apex_lab.errors import UserError
 
 HERE = "tests.test_components"
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.learner import Learner, Stretches, as_float, foreground_share, noise_seed
 from apex_lab.loggers import Curves
 from apex_lab.schedules import Constant, Linear

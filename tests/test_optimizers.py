@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from apex_lab import components
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.optimizers import QUINTIC, Muon, all_orthogonalised, is_matrix, orthogonalised
 
 

@@ -205,7 +205,7 @@ def test_killed_in_training_the_same_command_ends_as_unbroken(
 
 KILLED_WRITING = """
 import os, signal
-from apex_lab import files
+from apex_lab.base import files
 calls, place = 0, os.{function}
 def killing(*arguments):
     global calls

@@ -19,8 +19,8 @@ from typing import Any
 
 import torch
 
-from apex_lab.errors import UserError
-from apex_lab.files import replacing, unwritable
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import replacing, unwritable
 
 FORMAT = 1
 _KEYS = {"format", "step", "weights", "config", "choices", "training"}

@@ -26,11 +26,11 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from apex_lab import console
+from apex_lab.base import console
+from apex_lab.base.errors import UserError
+from apex_lab.base.interrupts import Interrupted, interruptible
+from apex_lab.base.validation import did_you_mean, one_line, sentence
 from apex_lab.config import conf_dir, plain
-from apex_lab.errors import UserError
-from apex_lab.interrupts import Interrupted, interruptible
-from apex_lab.validation import did_you_mean, one_line, sentence
 
 Check = Callable[[dict[str, Any], dict[str, str], Sequence[str]], Any]
 """(plain configuration, group -> word, overrides) -> a checked job; raises UserError."""

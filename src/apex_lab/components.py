@@ -18,8 +18,8 @@ from typing import Any
 from pydantic import ConfigDict, create_model
 from pydantic.errors import PydanticSchemaGenerationError, PydanticUndefinedAnnotation
 
-from apex_lab.errors import UserError
-from apex_lab.validation import did_you_mean, one_line, sentence, shown, validate
+from apex_lab.base.errors import UserError
+from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
 
 Node = Mapping[str, Any]
 

@@ -14,12 +14,12 @@ from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from apex_lab import components
+from apex_lab.base.errors import UserError
+from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
 from apex_lab.components import is_node
-from apex_lab.errors import UserError
 from apex_lab.metrics.modules import PAPER_SCORES
 from apex_lab.scene import SceneModel
 from apex_lab.schedules import Constant
-from apex_lab.validation import did_you_mean, one_line, sentence, shown, validate
 
 
 def conf_dir() -> Path:

@@ -14,13 +14,14 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from apex_lab import cli, config, console
-from apex_lab.errors import UserError
+from apex_lab import cli, config
+from apex_lab.base import console
+from apex_lab.base.errors import UserError
+from apex_lab.base.validation import did_you_mean, sentence, shown, validate
 from apex_lab.evaluation import OF_SCENES, Export, ScoringPart
 from apex_lab.evaluation.checkpoint import Request, evaluate_checkpoint, find, load
 from apex_lab.evaluation.others import Predictions, check_output, output_of, score_others
 from apex_lab.metrics import KEYS
-from apex_lab.validation import did_you_mean, sentence, shown, validate
 
 
 class EvaluateConfig(BaseModel):

@@ -18,7 +18,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.metrics import SceneMetrics, scene_identities
 from apex_lab.metrics.scenes import background_identities
 from apex_lab.scene import Scene, SceneModel, Schedule

@@ -14,11 +14,11 @@ from urllib.parse import urlsplit
 
 from lightning.pytorch.loggers import Logger
 
-from apex_lab import console
-from apex_lab.errors import UserError
-from apex_lab.files import unwritable, write_text
+from apex_lab.base import console
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import unwritable, write_text
+from apex_lab.base.validation import one_line
 from apex_lab.runs import Run, group_name
-from apex_lab.validation import one_line
 
 
 class Curves(Logger):

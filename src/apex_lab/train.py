@@ -13,7 +13,12 @@ import lightning as L
 import torch
 from lightning.pytorch.loggers import Logger
 
-from apex_lab import callbacks, checkpoints, cli, components, console, estimate, evaluation
+from apex_lab import callbacks, checkpoints, cli, components, estimate, evaluation
+from apex_lab.base import console
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import read_json
+from apex_lab.base.interrupts import Deferred, Interrupted, deferring
+from apex_lab.base.validation import one_line
 from apex_lab.config import (
     Job,
     build_lr_scale,
@@ -24,14 +29,10 @@ from apex_lab.config import (
     check_job,
 )
 from apex_lab.config import device as device_of
-from apex_lab.errors import UserError
-from apex_lab.files import read_json
-from apex_lab.interrupts import Deferred, Interrupted, deferring
 from apex_lab.learner import Learner, Stretches
 from apex_lab.loggers import Curves, Wandb
 from apex_lab.runs import Run, fingerprint, group_name
 from apex_lab.scene import SceneModel, schedule_at
-from apex_lab.validation import one_line
 
 
 def main() -> None:

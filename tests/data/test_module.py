@@ -12,10 +12,10 @@ import torch
 import yaml
 
 from apex_lab import components
+from apex_lab.base.errors import UserError
 from apex_lab.config import conf_dir
 from apex_lab.data import P2DModule
 from apex_lab.data import module as code
-from apex_lab.errors import UserError
 from sims.p2d.settings import Settings
 from tests.fakes.p2d_tools import FAKE
 

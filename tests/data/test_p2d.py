@@ -14,9 +14,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from apex_lab.base.errors import UserError
 from apex_lab.data import P2D
 from apex_lab.data.bench import frames_per_second
-from apex_lab.errors import UserError
 from sims.p2d.manifest import MANIFEST
 from tests.fakes.p2d_fake import simulate
 from tests.fakes.p2d_tools import REPOSITORY, make, small

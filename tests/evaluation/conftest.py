@@ -7,13 +7,14 @@ import pytest
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from apex_lab import checkpoints, console
+from apex_lab import checkpoints
+from apex_lab.base import console
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import write_json
+from apex_lab.base.interrupts import Interrupted
 from apex_lab.cli import CONFIG_ERROR, RUN_ERROR
 from apex_lab.config import build_model, plain
-from apex_lab.errors import UserError
 from apex_lab.evaluate import check_evaluation, evaluate
-from apex_lab.files import write_json
-from apex_lab.interrupts import Interrupted
 from tests.conftest import REPOSITORY, Ended, compose_job
 
 Make = Callable[..., Path]

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from filelock import FileLock
 
+from apex_lab.base.interrupts import Interrupted
 from apex_lab.evaluation import EXPORTS, Predictor
-from apex_lab.interrupts import Interrupted
 from apex_lab.metrics import KEYS
 from tests.evaluation.conftest import Ask, Make
 from tests.tiny import Layers, SquaresModule

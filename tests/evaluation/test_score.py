@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.evaluation import Parts, Predictor, ScoringPart, Tally, score, summary
 from apex_lab.evaluation.pictures import choose
 from apex_lab.metrics import EvaluatorSettings

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 from pycocotools import mask as pycoco
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.metrics.bench import synthetic_video
 from apex_lab.predictions import EXPORTS, PredictedVideo, open_truth, open_writer, score_predictions
 from apex_lab.predictions.coco import decode, encode, read_coco

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.metrics import KEYS, EvaluatorSettings, TrackingSettings
 from apex_lab.predictions import NpzWriter, PredictedVideo, score_predictions, write_result
 from apex_lab.predictions.npz import one_hot

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from apex_lab.base.errors import UserError
 from apex_lab.data import P2D
-from apex_lab.errors import UserError
 from apex_lab.predictions import PredictedVideo, open_truth, open_writer, p2d_video_name, score_predictions
 from tests.fakes.p2d_tools import make, small
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.tables.choose import REASONS, Choice, Version, choose
 from apex_lab.tables.found import collect
 from tests.tables.folders import VERSION, made, run_folder

@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from apex_lab.files import write_json
+from apex_lab.base.files import write_json
 from apex_lab.tables import export, latex, markdown
 from apex_lab.tables.build import Built
 from apex_lab.tables.commands import Command

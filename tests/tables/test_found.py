@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.learner import Learner
 from apex_lab.tables.found import SeedRun, collect, read_arrangement
 from tests.tables.folders import run_folder

@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.view import curve_page
 from apex_lab.view.curves import _panels, _read
 

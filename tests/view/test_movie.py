@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.view import Item, movie
 from apex_lab.view.canvas import GAP, MARGIN
 from apex_lab.view.colors import BACKGROUND_COLOR, color_of

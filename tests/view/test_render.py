@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.view import render_all
 from tests.view.scenes import item
 
@@ -51,7 +51,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_behind(tmp_path: Path) -> None:
     code = f"""
 import resource
 from pathlib import Path
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.view import component_panels, curve_page, film_strip, movie
 from tests.view.scenes import item
 folder, table = Path({str(tmp_path / "view")!r}), Path({str(tmp_path / "curves.csv")!r})

@@ -9,7 +9,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 
 Asked = TypeVar("Asked")
 Told = TypeVar("Told")

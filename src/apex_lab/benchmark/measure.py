@@ -14,10 +14,10 @@ import torch
 from torch._dynamo.exc import TorchDynamoException
 from torch._dynamo.utils import counters
 
+from apex_lab.base.validation import one_line
 from apex_lab.benchmark.parts import PARTS
 from apex_lab.benchmark.work import Workload
 from apex_lab.config import Config
-from apex_lab.validation import one_line
 
 Mode = Literal["eager", "compiled", "cuda graph"]
 GIB = 2**30

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from torch.utils.data import DataLoader
 
+from apex_lab.base.errors import UserError
 from apex_lab.data.batches import TrainBatches
 from apex_lab.data.p2d import P2D
-from apex_lab.errors import UserError
 
 FOREVER = 10**9
 

@@ -13,9 +13,9 @@ from pydantic import Field, ValidationError
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
+from apex_lab.base.errors import UserError
 from apex_lab.data.batches import TrainBatches
 from apex_lab.data.p2d import P2D
-from apex_lab.errors import UserError
 from sims.errors import SimError
 from sims.p2d.generate import generate
 from sims.p2d.manifest import MANIFEST, Manifest, fingerprint

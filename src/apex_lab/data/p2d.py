@@ -22,7 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from sims.errors import SimError
 from sims.p2d.store import FIELDS, SPLITS, array_path
 from sims.p2d.verify import check

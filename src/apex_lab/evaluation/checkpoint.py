@@ -14,18 +14,19 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 
-from apex_lab import checkpoints, components, config, console, provenance
-from apex_lab.errors import UserError
+from apex_lab import checkpoints, components, config, provenance
+from apex_lab.base import console
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import make_folder, read_json
+from apex_lab.base.validation import one_line, sentence
 from apex_lab.evaluation.export import export_path
 from apex_lab.evaluation.parts import Parts
 from apex_lab.evaluation.record import summary
 from apex_lab.evaluation.score import Predictor
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.evaluation.whole import Asked, evaluate
-from apex_lab.files import make_folder, read_json
 from apex_lab.metrics.evaluator import versions
 from apex_lab.scene import SceneModel, schedule_at
-from apex_lab.validation import one_line, sentence
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from apex_lab import console
-from apex_lab.errors import UserError
+from apex_lab.base import console
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import unwritable
+from apex_lab.base.progress import Meter
 from apex_lab.evaluation.record import summary
 from apex_lab.evaluation.scoring import ScoringPart
-from apex_lab.files import unwritable
 from apex_lab.metrics import by_property
 from apex_lab.predictions import score_predictions, write_result
 from apex_lab.predictions.score import plain
-from apex_lab.progress import Meter
 
 
 @dataclass(frozen=True)

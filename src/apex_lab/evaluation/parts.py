@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Integer
 
-from apex_lab.errors import UserError
-from apex_lab.files import make_folder, replacing
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import make_folder, replacing
 from apex_lab.metrics import Evaluator, EvaluatorSettings
 
 

@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 from torch.utils.data import default_collate
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import make_folder
 from apex_lab.evaluation.score import Batches, Predictor
-from apex_lab.files import make_folder
 from apex_lab.metrics import KEYS
 from apex_lab.view import Item, render_all
 from apex_lab.view.curves import has_rows

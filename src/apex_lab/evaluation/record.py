@@ -9,9 +9,9 @@ from typing import Any
 
 import pandas as pd
 
+from apex_lab.base.files import make_folder, read_json, write_json, write_text
 from apex_lab.evaluation.parts import Tally
 from apex_lab.evaluation.pictures import Chosen
-from apex_lab.files import make_folder, read_json, write_json, write_text
 from apex_lab.metrics import by_property
 from apex_lab.predictions.score import plain
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.predictions.coco import CocoWriter
 from apex_lab.predictions.davis import DavisWriter
 from apex_lab.predictions.mot import MotWriter

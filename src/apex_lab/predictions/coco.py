@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Bool, Int64, Integer
 from pycocotools import mask as coco
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.predictions.video import PredictedVideo, with_rest
 from apex_lab.scene import ABSENT
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Int64, UInt8
 from PIL import Image, UnidentifiedImageError
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.predictions.video import PredictedVideo
 
 MAX_INDEX = 255

@@ -14,7 +14,7 @@ from types import TracebackType
 import numpy as np
 from jaxtyping import Int64, Integer
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.predictions.coco import decode, encode
 from apex_lab.predictions.davis import plain_name
 from apex_lab.predictions.video import PredictedVideo, with_rest

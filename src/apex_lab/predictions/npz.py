@@ -18,7 +18,7 @@ from types import TracebackType
 import numpy as np
 from jaxtyping import Int64, Integer
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.predictions.video import PredictedVideo, check_labels, hard_segmentation, resized
 from apex_lab.scene import ABSENT
 

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Int64, Integer
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.metrics import Evaluator, EvaluatorSettings
 from apex_lab.metrics.keys import keys
 from apex_lab.metrics.objects import ObjectMetadata

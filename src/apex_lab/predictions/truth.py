@@ -8,8 +8,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Integer
 
+from apex_lab.base.errors import UserError
 from apex_lab.data.p2d import P2D
-from apex_lab.errors import UserError
 from apex_lab.metrics.objects import ObjectMetadata, p2d_metadata
 from apex_lab.predictions.davis import read_davis, video_names
 from apex_lab.predictions.npz import NpzFile

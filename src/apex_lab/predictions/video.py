@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int64, Integer, Shaped
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.metrics.evaluator import MAX_IDENTITY
 from apex_lab.scene import ABSENT
 

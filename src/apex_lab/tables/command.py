@@ -20,16 +20,17 @@ from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field
 
-from apex_lab import cli, config, console, provenance, runs
-from apex_lab.errors import UserError
-from apex_lab.files import make_folder, write_json, write_text
+from apex_lab import cli, config, provenance, runs
+from apex_lab.base import console
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import make_folder, write_json, write_text
+from apex_lab.base.validation import shown, validate
 from apex_lab.tables import export, latex, markdown, spec
 from apex_lab.tables.build import Built, build
 from apex_lab.tables.choose import Choice, Version, choose
 from apex_lab.tables.commands import Command, missing_runs
 from apex_lab.tables.found import SeedRun, collect
 from apex_lab.tables.rows import Options
-from apex_lab.validation import shown, validate
 
 GROUPS = ("data", "scale", "paths")
 """Groups that choose which runs are read."""

@@ -12,10 +12,10 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from apex_lab.errors import UserError
-from apex_lab.files import read_json
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import read_json
+from apex_lab.base.validation import sentence, shown, validate
 from apex_lab.metrics import KEYS
-from apex_lab.validation import sentence, shown, validate
 
 MIN_SHARE, MAX_SHARE = 0.001, 0.999
 """A seed has failed whose objects are given less or more of the validation pixels (metrics.md section 3)."""

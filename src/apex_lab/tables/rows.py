@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.tables.choose import Choice
 from apex_lab.tables.found import Protocol, SeedRun, listed, read_arrangement
 from apex_lab.tables.spec import Column, Published, Row, Specification, Table

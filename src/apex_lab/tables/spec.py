@@ -10,8 +10,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field
 
 import apex_lab
-from apex_lab.errors import UserError
-from apex_lab.validation import one_line, sentence, validate
+from apex_lab.base.errors import UserError
+from apex_lab.base.validation import one_line, sentence, validate
 
 Published = tuple[float, float]
 """Mean and standard deviation as the paper prints them."""

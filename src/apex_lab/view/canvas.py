@@ -12,7 +12,7 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from apex_lab.files import make_folder, replacing
+from apex_lab.base.files import make_folder, replacing
 from apex_lab.view.colors import Color
 
 PAPER: Color = (255, 255, 255)

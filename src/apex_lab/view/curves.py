@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 from apex_lab.view.canvas import picture_file
 from apex_lab.view.colors import PALETTE
 

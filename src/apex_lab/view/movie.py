@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from apex_lab.errors import UserError
-from apex_lab.files import unwritable
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import unwritable
 from apex_lab.view.canvas import FAINT, GAP, INK, MARGIN, cell_size, fit, font, picture_file, sheet
 from apex_lab.view.item import Clip, Item
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 
 
 @contextlib.contextmanager

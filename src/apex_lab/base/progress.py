@@ -9,7 +9,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from apex_lab import console
+from apex_lab.base import console
 from apex_lab.estimate import readable
 
 

@@ -4,8 +4,8 @@ import time
 
 import pytest
 
-from apex_lab import console
-from apex_lab.progress import Meter
+from apex_lab.base import console
+from apex_lab.base.progress import Meter
 
 
 @pytest.fixture(autouse=True)

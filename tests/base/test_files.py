@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from apex_lab.errors import UserError
-from apex_lab.files import make_folder, read_json, replacing, write_json, write_text
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import make_folder, read_json, replacing, write_json, write_text
 
 
 def test_a_file_changes_only_when_it_is_whole(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from apex_lab.errors import UserError
+from apex_lab.base.errors import UserError
 
 
 def one_line(error: BaseException | str) -> str:
