@@ -25,7 +25,7 @@ from apex_lab.benchmark import child, compare, report
 from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.parts import PARTS
 from apex_lab.benchmark.work import Workload
-from apex_lab.config import check_job
+from apex_lab.config.schema import check_job
 from apex_lab.optimizers import Muon
 from tests.conftest import TINY, Ended, compose_job
 
@@ -149,7 +149,7 @@ ONE_GRAPH = """
 import json, sys
 import torch
 from apex_lab.benchmark.work import Workload
-from apex_lab.config import check_job
+from apex_lab.config.schema import check_job
 work = Workload(check_job(json.load(sys.stdin), {}).config, torch.device("cpu"), 1, 2)
 work.model.train()
 forward = torch.compile(work.model.forward, backend="eager", fullgraph=True)  # raises where a graph would break

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from apex_lab import estimate
-from apex_lab.config import build_model
+from apex_lab.config.schema import build_model
 from apex_lab.scene import Scene, Schedule
 from tests.conftest import compose_job
 from tests.tiny import Layers

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from apex_lab import components
 from apex_lab.base.errors import UserError
+from apex_lab.config.schema import components
 from apex_lab.optimizers import QUINTIC, Muon, all_orthogonalised, is_matrix, orthogonalised
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from apex_lab.config import Job
+from apex_lab.config.schema import Job
 from apex_lab.runs import HARMLESS, Run, fingerprint, group_name, run_folder
 from tests.conftest import compose_job
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 
-from apex_lab import cli, provenance
+from apex_lab import provenance
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json
@@ -26,8 +26,9 @@ from apex_lab.benchmark import report
 from apex_lab.benchmark.child import in_child
 from apex_lab.benchmark.compare import Comparison, compare
 from apex_lab.benchmark.measure import Case, Mode, measure
-from apex_lab.config import Config, Job, build_model, check_job
-from apex_lab.config import device as device_of
+from apex_lab.config.schema import Config, Job, build_model, check_job
+from apex_lab.config.schema import command_line as cli
+from apex_lab.config.schema import device as device_of
 from apex_lab.models.apex import Apex
 from apex_lab.runs import group_name
 

@@ -7,7 +7,7 @@ import time
 
 import torch
 
-from apex_lab.config import Config, build_schedules, build_weights
+from apex_lab.config.schema import Config, build_schedules, build_weights
 from apex_lab.scene import SceneModel, schedule_at
 
 SMALL = 5e9

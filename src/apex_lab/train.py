@@ -13,13 +13,13 @@ import lightning as L
 import torch
 from lightning.pytorch.loggers import Logger
 
-from apex_lab import callbacks, checkpoints, cli, components, estimate, evaluation
+from apex_lab import callbacks, checkpoints, estimate, evaluation
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.interrupts import Deferred, Interrupted, deferring
 from apex_lab.base.validation import one_line
-from apex_lab.config import (
+from apex_lab.config.schema import (
     Job,
     build_lr_scale,
     build_model,
@@ -27,8 +27,10 @@ from apex_lab.config import (
     build_schedules,
     build_weights,
     check_job,
+    components,
 )
-from apex_lab.config import device as device_of
+from apex_lab.config.schema import command_line as cli
+from apex_lab.config.schema import device as device_of
 from apex_lab.learner import Learner, Stretches
 from apex_lab.loggers import Curves, Wandb
 from apex_lab.runs import Run, fingerprint, group_name

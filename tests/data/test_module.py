@@ -11,9 +11,8 @@ import pytest
 import torch
 import yaml
 
-from apex_lab import components
 from apex_lab.base.errors import UserError
-from apex_lab.config import conf_dir
+from apex_lab.config.schema import components, conf_dir
 from apex_lab.data import P2DModule
 from apex_lab.data import module as code
 from sims.p2d.settings import Settings

@@ -12,8 +12,8 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import write_json
 from apex_lab.base.interrupts import Interrupted
-from apex_lab.cli import CONFIG_ERROR, RUN_ERROR
-from apex_lab.config import build_model, plain
+from apex_lab.config.command_line import CONFIG_ERROR, RUN_ERROR
+from apex_lab.config.schema import build_model, plain
 from apex_lab.evaluate import check_evaluation, evaluate
 from tests.conftest import REPOSITORY, Ended, compose_job
 

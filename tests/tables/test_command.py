@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
-from apex_lab import config, runs
+from apex_lab import runs
+from apex_lab.config.schema import schema as config
 from tests.conftest import Ended
 from tests.tables.folders import run_folder
 

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from apex_lab.base.errors import UserError
-from apex_lab.config import conf_dir
+from apex_lab.config.schema import conf_dir
 from apex_lab.metrics import KEYS
 from apex_lab.tables import spec
 from apex_lab.tables.spec import Table

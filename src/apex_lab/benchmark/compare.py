@@ -15,13 +15,12 @@ from typing import Any
 
 import torch
 
-from apex_lab import components
 from apex_lab.base.errors import UserError
 from apex_lab.benchmark.child import death
 from apex_lab.benchmark.measure import once, spread
 from apex_lab.benchmark.straightforward import Straightforward
 from apex_lab.benchmark.work import Workload
-from apex_lab.config import Config
+from apex_lab.config.schema import Config, components
 from apex_lab.models.apex import Apex
 
 APEX = "apex"

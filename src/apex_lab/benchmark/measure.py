@@ -17,7 +17,7 @@ from torch._dynamo.utils import counters
 from apex_lab.base.validation import one_line
 from apex_lab.benchmark.parts import PARTS
 from apex_lab.benchmark.work import Workload
-from apex_lab.config import Config
+from apex_lab.config.schema import Config
 
 Mode = Literal["eager", "compiled", "cuda graph"]
 GIB = 2**30

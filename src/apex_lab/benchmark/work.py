@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from apex_lab.benchmark.parts import Clock, watched
-from apex_lab.config import Config, build_model, build_optimizer, build_schedules, build_weights
+from apex_lab.config.schema import Config, build_model, build_optimizer, build_schedules, build_weights
 from apex_lab.learner import Learner, as_float
 from apex_lab.scene import SceneModel
 

@@ -14,11 +14,13 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 
-from apex_lab import checkpoints, components, config, provenance
+from apex_lab import checkpoints, provenance
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, read_json
 from apex_lab.base.validation import one_line, sentence
+from apex_lab.config.schema import components
+from apex_lab.config.schema import schema as config
 from apex_lab.evaluation.export import export_path
 from apex_lab.evaluation.parts import Parts
 from apex_lab.evaluation.record import summary

@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from apex_lab.config import Config, build_model, build_optimizer, build_schedules, build_weights
+from apex_lab.config.schema import Config, build_model, build_optimizer, build_schedules, build_weights
 from apex_lab.learner import Learner
 from apex_lab.models.apex import Apex, FeatureGlimpses, GaussianLikelihood, ImageGlimpses
 from apex_lab.scene import Scene

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from apex_lab.base.errors import UserError
-from apex_lab.config import build_model, conf_dir
+from apex_lab.config.schema import build_model, conf_dir
 from tests.conftest import REPOSITORY, compose_job
 
 

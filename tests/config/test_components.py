@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import Tensor
 
 from apex_lab.base.errors import UserError
-from apex_lab.components import build, check
+from apex_lab.config.components import build, check
 
 HERE = "tests.test_components"
 

@@ -13,10 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from apex_lab import components
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
-from apex_lab.components import is_node
+from apex_lab.config.components import is_node
+from apex_lab.config.schema import components
 from apex_lab.metrics.modules import PAPER_SCORES
 from apex_lab.scene import SceneModel
 from apex_lab.schedules import Constant
@@ -71,7 +71,7 @@ class PathsPart(_Part):
 
 
 class Config(_Part):
-    """The root of what `python -m apex_lab.train` composes; components are checked by `apex_lab.components`."""
+    """The root of what `python -m apex_lab.train` composes; components are checked by `apex_lab.config.components`."""
 
     seed: int = Field(ge=0, lt=2**32)
     model: dict[str, Any]

@@ -30,7 +30,7 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted, interruptible
 from apex_lab.base.validation import did_you_mean, one_line, sentence
-from apex_lab.config import conf_dir, plain
+from apex_lab.config.schema import conf_dir, plain
 
 Check = Callable[[dict[str, Any], dict[str, str], Sequence[str]], Any]
 """(plain configuration, group -> word, overrides) -> a checked job; raises UserError."""
