@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from apex_lab import checkpoints
 from apex_lab.config.schema import build_model, check_job
+from apex_lab.runs.folder import checkpoints
 from apex_lab.scene import schedule_at
 from tests.conftest import REPOSITORY
 

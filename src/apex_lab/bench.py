@@ -17,7 +17,6 @@ from typing import Any, Literal
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 
-from apex_lab import provenance
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json
@@ -30,7 +29,7 @@ from apex_lab.config.schema import Config, Job, build_model, check_job
 from apex_lab.config.schema import command_line as cli
 from apex_lab.config.schema import device as device_of
 from apex_lab.models.apex import Apex
-from apex_lab.runs import group_name
+from apex_lab.runs.folder import group_name, provenance
 
 
 class BenchPart(BaseModel):

@@ -9,12 +9,11 @@ from typing import Annotated, Any, Literal
 import lightning as L
 from pydantic import Field
 
-from apex_lab import checkpoints
 from apex_lab.base import console
 from apex_lab.base.interrupts import Deferred
 from apex_lab.base.progress import Meter
 from apex_lab.learner import Learner
-from apex_lab.runs import Run
+from apex_lab.runs.folder import Run, checkpoints
 
 
 class Checkpoints(L.Callback):

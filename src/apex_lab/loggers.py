@@ -18,7 +18,7 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import unwritable, write_text
 from apex_lab.base.validation import one_line
-from apex_lab.runs import Run, group_name
+from apex_lab.runs.folder import Run, group_name
 
 
 class Curves(Logger):

@@ -13,7 +13,7 @@ import lightning as L
 import torch
 from lightning.pytorch.loggers import Logger
 
-from apex_lab import callbacks, checkpoints, estimate, evaluation
+from apex_lab import callbacks, estimate, evaluation
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
@@ -33,7 +33,7 @@ from apex_lab.config.schema import command_line as cli
 from apex_lab.config.schema import device as device_of
 from apex_lab.learner import Learner, Stretches
 from apex_lab.loggers import Curves, Wandb
-from apex_lab.runs import Run, fingerprint, group_name
+from apex_lab.runs.folder import Run, checkpoints, fingerprint, group_name
 from apex_lab.scene import SceneModel, schedule_at
 
 

@@ -7,7 +7,6 @@ import pytest
 import yaml
 from omegaconf import DictConfig, OmegaConf
 
-from apex_lab import checkpoints
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import write_json
@@ -15,6 +14,7 @@ from apex_lab.base.interrupts import Interrupted
 from apex_lab.config.command_line import CONFIG_ERROR, RUN_ERROR
 from apex_lab.config.schema import build_model, plain
 from apex_lab.evaluate import check_evaluation, evaluate
+from apex_lab.runs.folder import checkpoints
 from tests.conftest import REPOSITORY, Ended, compose_job
 
 Make = Callable[..., Path]

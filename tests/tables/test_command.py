@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
-from apex_lab import runs
 from apex_lab.config.schema import schema as config
+from apex_lab.runs.folder import folder as runs
 from tests.conftest import Ended
 from tests.tables.folders import run_folder
 
@@ -64,7 +64,7 @@ def test_tables_are_printed_stored_and_their_paths_told(tables: Callable[..., En
 def test_the_same_runs_give_the_same_bytes(
     tables: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("apex_lab.provenance.commit", lambda: ("0" * 40, False))
+    monkeypatch.setattr("apex_lab.runs.provenance.commit", lambda: ("0" * 40, False))
     run_folder(tmp_path / "outputs", "apex", 0)
     for name in ("one", "two"):
         assert tables("tables=[1]", f"folder={name}").code == 0

@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from filelock import FileLock, Timeout
 
-from apex_lab import checkpoints, provenance
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, read_json
@@ -28,6 +27,7 @@ from apex_lab.evaluation.score import Predictor
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.evaluation.whole import Asked, evaluate
 from apex_lab.metrics.evaluator import versions
+from apex_lab.runs.folder import checkpoints, provenance
 from apex_lab.scene import SceneModel, schedule_at
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from apex_lab.runs import HARMLESS
+from apex_lab.runs.folder import HARMLESS
 from apex_lab.tables.found import Protocol, SeedRun, listed, run_words
 
 T = TypeVar("T")

@@ -26,10 +26,10 @@ import torch
 import yaml
 from filelock import FileLock, Timeout
 
-from apex_lab import provenance
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, read_json, write_json, write_text
 from apex_lab.config.schema import Job
+from apex_lab.runs.folder import provenance
 
 HARMLESS = (
     "seed",

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from apex_lab.config.schema import Job
-from apex_lab.runs import HARMLESS, Run, fingerprint, group_name, run_folder
+from apex_lab.runs.folder import HARMLESS, Run, fingerprint, group_name, run_folder
 from tests.conftest import compose_job
 
 

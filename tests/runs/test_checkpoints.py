@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from apex_lab import checkpoints
 from apex_lab.base.errors import UserError
+from apex_lab.runs.folder import checkpoints
 
 
 def content(step: int = 3) -> dict[str, Any]:
