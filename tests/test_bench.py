@@ -26,7 +26,7 @@ from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.parts import PARTS
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.schema import check_job
-from apex_lab.optimizers import Muon
+from apex_lab.training.optimizers import Muon
 from tests.conftest import TINY, Ended, compose_job
 
 APEX = ("model=apex", "data=p2d", "scale=smoke", "trainer=cpu")

@@ -368,8 +368,8 @@ def test_long_training_on_a_cpu_is_announced(
     train: Callable[..., Ended], monkeypatch: pytest.MonkeyPatch, the_run: Callable[..., Path]
 ) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    monkeypatch.setattr("apex_lab.estimate.SMALL", 0.0)
-    monkeypatch.setattr("apex_lab.estimate.LONG", 0.0)
+    monkeypatch.setattr("apex_lab.training.estimate.SMALL", 0.0)
+    monkeypatch.setattr("apex_lab.training.estimate.LONG", 0.0)
     ended = train()
     assert ended.code == 0
     assert "Training will take about" in ended.err

@@ -13,7 +13,7 @@ import lightning as L
 import torch
 from lightning.pytorch.loggers import Logger
 
-from apex_lab import callbacks, estimate, evaluation
+from apex_lab import evaluation
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
@@ -31,10 +31,11 @@ from apex_lab.config.schema import (
 )
 from apex_lab.config.schema import command_line as cli
 from apex_lab.config.schema import device as device_of
-from apex_lab.learner import Learner, Stretches
-from apex_lab.loggers import Curves, Wandb
 from apex_lab.runs.folder import Run, checkpoints, fingerprint, group_name
 from apex_lab.scene import SceneModel, schedule_at
+from apex_lab.training import callbacks, estimate
+from apex_lab.training.learner import Learner, Stretches
+from apex_lab.training.loggers import Curves, Wandb
 
 
 def main() -> None:

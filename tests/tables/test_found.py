@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from apex_lab.base.errors import UserError
-from apex_lab.learner import Learner
 from apex_lab.tables.found import SeedRun, collect, read_arrangement
+from apex_lab.training.learner import Learner
 from tests.tables.folders import run_folder
 
 

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from apex_lab.base import console
-from apex_lab.estimate import readable
+from apex_lab.training.estimate import readable
 
 
 class Meter:

@@ -19,7 +19,7 @@ from apex_lab.config.components import is_node
 from apex_lab.config.schema import components
 from apex_lab.metrics.modules import PAPER_SCORES
 from apex_lab.scene import SceneModel
-from apex_lab.schedules import Constant
+from apex_lab.training.schedules import Constant
 
 
 def conf_dir() -> Path:
@@ -262,7 +262,7 @@ def _check_objective(config: Config) -> None:
     values["lr_scale"] = build_lr_scale(config)
     for key, value in values.items():
         if not callable(value):
-            raise UserError(f"{key} is not a schedule: choose one of apex_lab.schedules.")
+            raise UserError(f"{key} is not a schedule: choose one of apex_lab.training.schedules.")
     ranges = dict.fromkeys(values, (0.0, math.inf)) | dict.fromkeys(
         (f"schedule.{name}" for name in schedules), (-math.inf, math.inf)
     )

@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from apex_lab.config.schema import Config, build_model, build_optimizer, build_schedules, build_weights
-from apex_lab.learner import Learner
 from apex_lab.models.apex import Apex, FeatureGlimpses, GaussianLikelihood, ImageGlimpses
 from apex_lab.scene import Scene
+from apex_lab.training.learner import Learner
 from tests.conftest import REPOSITORY, compose_job
 from tests.models.apex import naive
 from tests.models.apex.small import SIZE, Inside, resolved, video

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from apex_lab.loggers import Curves, credentials
+from apex_lab.training.loggers import Curves, credentials
 from tests.conftest import Ended
 
 
@@ -96,7 +96,7 @@ def test_wandb_with_a_network_that_is_away_falls_back_to_offline(
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("WANDB_API_KEY", "0" * 40)
     monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")  # the discard port: nobody answers
-    monkeypatch.setattr("apex_lab.loggers.TIMEOUT", 3.0)
+    monkeypatch.setattr("apex_lab.training.loggers.TIMEOUT", 3.0)
     ended = train("logger=wandb")
     assert ended.code == 0, ended.err
     assert "wandb: cannot be reached" in ended.err

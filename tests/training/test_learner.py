@@ -10,9 +10,9 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from apex_lab.base.errors import UserError
-from apex_lab.learner import Learner, Stretches, as_float, foreground_share, noise_seed
-from apex_lab.loggers import Curves
-from apex_lab.schedules import Constant, Linear
+from apex_lab.training.learner import Learner, Stretches, as_float, foreground_share, noise_seed
+from apex_lab.training.loggers import Curves
+from apex_lab.training.schedules import Constant, Linear
 from tests.tiny import Layers, SquaresModule
 
 WEIGHTS = {"error": Constant(1.0), "spread": Linear(0.5, 1.5, 10)}

@@ -22,7 +22,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.metrics import SceneMetrics, scene_identities
 from apex_lab.metrics.scenes import background_identities
 from apex_lab.scene import Scene, SceneModel, Schedule
-from apex_lab.schedules import Constant
+from apex_lab.training.schedules import Constant
 
 Batch = Mapping[str, Any]
 """`video` uint8 (B, T, 3, H, W), `segmentation` uint8 (B, T, H, W), `index` int (B,)."""

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from apex_lab.base.errors import UserError
 from apex_lab.config.schema import components
-from apex_lab.optimizers import QUINTIC, Muon, all_orthogonalised, is_matrix, orthogonalised
+from apex_lab.training.optimizers import QUINTIC, Muon, all_orthogonalised, is_matrix, orthogonalised
 
 
 def test_orthogonalised_keeps_singular_vectors_and_maps_singular_values_by_the_quintic() -> None:
@@ -67,7 +67,7 @@ def test_weights_whose_gradients_vanish_come_to_rest() -> None:
 
 
 def test_too_many_iterations_are_refused() -> None:
-    node = {"_target_": "apex_lab.optimizers.Muon", "iterations": 9}
+    node = {"_target_": "apex_lab.training.optimizers.Muon", "iterations": 9}
     with pytest.raises(UserError, match=r"optimizer\.iterations = 9 is wrong"):
         components.check(node, "optimizer", supplied=["params"])
 

@@ -12,8 +12,8 @@ from pydantic import Field
 from apex_lab.base import console
 from apex_lab.base.interrupts import Deferred
 from apex_lab.base.progress import Meter
-from apex_lab.learner import Learner
 from apex_lab.runs.folder import Run, checkpoints
+from apex_lab.training.learner import Learner
 
 
 class Checkpoints(L.Callback):

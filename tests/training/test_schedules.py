@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apex_lab.schedules import Constant, Cosine, Exponential, Linear, Piecewise, Schedule
+from apex_lab.training.schedules import Constant, Cosine, Exponential, Linear, Piecewise, Schedule
 
 
 def test_constant() -> None:
