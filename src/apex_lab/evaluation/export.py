@@ -9,7 +9,7 @@ from typing import Any, Literal
 from torch.utils.data import Dataset
 
 from apex_lab.evaluation.parts import Tally
-from apex_lab.predictions import PredictedVideo, open_writer
+from apex_lab.formats import PredictedVideo, open_writer
 
 Export = Literal["npz", "coco", "weis", "davis", "mots", "mot"]
 EXPORTS: Sequence[str] = ("npz", "coco", "weis", "davis", "mots", "mot")

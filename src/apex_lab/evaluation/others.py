@@ -13,9 +13,9 @@ from apex_lab.base.files import unwritable
 from apex_lab.base.progress import Meter
 from apex_lab.evaluation.record import summary
 from apex_lab.evaluation.scoring import ScoringPart
+from apex_lab.formats import score_predictions, write_result
+from apex_lab.formats.score import plain
 from apex_lab.metrics import by_property
-from apex_lab.predictions import score_predictions, write_result
-from apex_lab.predictions.score import plain
 
 
 @dataclass(frozen=True)

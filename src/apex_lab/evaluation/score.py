@@ -14,8 +14,8 @@ from apex_lab.base.progress import Meter
 from apex_lab.base.validation import one_line
 from apex_lab.evaluation.parts import Parts, Tally
 from apex_lab.evaluation.scoring import ScoringPart
+from apex_lab.formats import p2d_video_name
 from apex_lab.metrics import ObjectMetadata, background_identities, p2d_metadata, scene_identities
-from apex_lab.predictions import p2d_video_name
 from apex_lab.scene import Scene, SceneModel, Schedule
 from apex_lab.training.learner import Batch, as_float, foreground_share
 

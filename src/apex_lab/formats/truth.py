@@ -10,9 +10,9 @@ from jaxtyping import Integer
 
 from apex_lab.base.errors import UserError
 from apex_lab.data.p2d import P2D
+from apex_lab.formats.davis import read_davis, video_names
+from apex_lab.formats.npz import NpzFile
 from apex_lab.metrics.objects import ObjectMetadata, p2d_metadata
-from apex_lab.predictions.davis import read_davis, video_names
-from apex_lab.predictions.npz import NpzFile
 
 
 @runtime_checkable

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Int64, Integer
 from pycocotools import mask as coco
 
 from apex_lab.base.errors import UserError
-from apex_lab.predictions.video import PredictedVideo, with_rest
+from apex_lab.formats.video import PredictedVideo, with_rest
 from apex_lab.scene import ABSENT
 
 SMALL_MASK = 5

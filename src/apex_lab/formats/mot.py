@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
-from apex_lab.predictions.coco import decode, encode
-from apex_lab.predictions.davis import plain_name
-from apex_lab.predictions.video import PredictedVideo, with_rest
+from apex_lab.formats.coco import decode, encode
+from apex_lab.formats.davis import plain_name
+from apex_lab.formats.video import PredictedVideo, with_rest
 from apex_lab.scene import ABSENT
 
 MOTS_CLASS = 1

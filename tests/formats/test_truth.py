@@ -9,7 +9,7 @@ import pytest
 
 from apex_lab.base.errors import UserError
 from apex_lab.data import P2D
-from apex_lab.predictions import PredictedVideo, open_truth, open_writer, p2d_video_name, score_predictions
+from apex_lab.formats import PredictedVideo, open_truth, open_writer, p2d_video_name, score_predictions
 from tests.fakes.p2d_tools import make, small
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from apex_lab.base.errors import UserError
+from apex_lab.formats import NpzWriter, PredictedVideo, score_predictions, write_result
+from apex_lab.formats.npz import one_hot
 from apex_lab.metrics import KEYS, EvaluatorSettings, TrackingSettings
-from apex_lab.predictions import NpzWriter, PredictedVideo, score_predictions, write_result
-from apex_lab.predictions.npz import one_hot
 
 FIXTURES = Path(__file__).parents[1] / "metrics" / "fixtures"
 PUBLIC = FIXTURES / "metrics_public.npz"

@@ -15,15 +15,15 @@ import pandas as pd
 from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
+from apex_lab.formats.coco import read_coco
+from apex_lab.formats.davis import read_davis, video_names
+from apex_lab.formats.mot import read_mots
+from apex_lab.formats.npz import NpzFile
+from apex_lab.formats.truth import Truth, open_truth
+from apex_lab.formats.video import fit
 from apex_lab.metrics import Evaluator, EvaluatorSettings
 from apex_lab.metrics.keys import keys
 from apex_lab.metrics.objects import ObjectMetadata
-from apex_lab.predictions.coco import read_coco
-from apex_lab.predictions.davis import read_davis, video_names
-from apex_lab.predictions.mot import read_mots
-from apex_lab.predictions.npz import NpzFile
-from apex_lab.predictions.truth import Truth, open_truth
-from apex_lab.predictions.video import fit
 
 FORMAT_VERSION = 1
 

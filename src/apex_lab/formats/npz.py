@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
-from apex_lab.predictions.video import PredictedVideo, check_labels, hard_segmentation, resized
+from apex_lab.formats.video import PredictedVideo, check_labels, hard_segmentation, resized
 from apex_lab.scene import ABSENT
 
 PARTS = ("gt", "masks", "ids")

@@ -19,13 +19,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from apex_lab.base.errors import UserError
-from apex_lab.predictions.coco import CocoWriter
-from apex_lab.predictions.davis import DavisWriter
-from apex_lab.predictions.mot import MotWriter
-from apex_lab.predictions.npz import NpzWriter
-from apex_lab.predictions.score import score_predictions, write_result
-from apex_lab.predictions.truth import open_truth, p2d_video_name
-from apex_lab.predictions.video import PredictedVideo
+from apex_lab.formats.coco import CocoWriter
+from apex_lab.formats.davis import DavisWriter
+from apex_lab.formats.mot import MotWriter
+from apex_lab.formats.npz import NpzWriter
+from apex_lab.formats.score import score_predictions, write_result
+from apex_lab.formats.truth import open_truth, p2d_video_name
+from apex_lab.formats.video import PredictedVideo
 
 EXPORTS = ("npz", "coco", "weis", "davis", "mots", "mot")
 """Formats that `open_writer` writes."""

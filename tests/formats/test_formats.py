@@ -11,11 +11,11 @@ from PIL import Image
 from pycocotools import mask as pycoco
 
 from apex_lab.base.errors import UserError
+from apex_lab.formats import EXPORTS, PredictedVideo, open_truth, open_writer, score_predictions
+from apex_lab.formats.coco import decode, encode, read_coco
+from apex_lab.formats.davis import palette, read_davis
+from apex_lab.formats.mot import read_mots
 from apex_lab.metrics.bench import synthetic_video
-from apex_lab.predictions import EXPORTS, PredictedVideo, open_truth, open_writer, score_predictions
-from apex_lab.predictions.coco import decode, encode, read_coco
-from apex_lab.predictions.davis import palette, read_davis
-from apex_lab.predictions.mot import read_mots
 
 
 def videos() -> Iterator[PredictedVideo]:

@@ -15,7 +15,7 @@ from jaxtyping import Int64, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from apex_lab.base.errors import UserError
-from apex_lab.predictions.video import PredictedVideo
+from apex_lab.formats.video import PredictedVideo
 
 MAX_INDEX = 255
 
