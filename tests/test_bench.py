@@ -21,9 +21,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from apex_lab import bench
 from apex_lab.base.errors import UserError
-from apex_lab.benchmark import child, compare, report
+from apex_lab.benchmark import child, compare
+from apex_lab.benchmark import rows as report
 from apex_lab.benchmark.measure import Case, measure
-from apex_lab.benchmark.parts import PARTS
+from apex_lab.benchmark.profile import PARTS
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.schema import check_job
 from apex_lab.training.optimizers import Muon

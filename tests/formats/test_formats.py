@@ -15,7 +15,7 @@ from apex_lab.formats import EXPORTS, PredictedVideo, open_truth, open_writer, s
 from apex_lab.formats.coco import decode, encode, read_coco
 from apex_lab.formats.davis import palette, read_davis
 from apex_lab.formats.mot import read_mots
-from apex_lab.metrics.bench import synthetic_video
+from apex_lab.metrics.bench_scoring import synthetic_video
 
 
 def videos() -> Iterator[PredictedVideo]:

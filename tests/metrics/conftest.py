@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from apex_lab.metrics.bench import synthetic_video
+from apex_lab.metrics.bench_scoring import synthetic_video
 from apex_lab.metrics.contingency import contingency
 
 FIXTURES = Path(__file__).parent / "fixtures"

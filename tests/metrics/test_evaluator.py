@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from pandas.testing import assert_frame_equal
 
-from apex_lab.metrics import KEYS, Evaluator, EvaluatorSettings, TrackingSettings, bench
+from apex_lab.metrics import KEYS, Evaluator, EvaluatorSettings, TrackingSettings
+from apex_lab.metrics import bench_scoring as bench
 from apex_lab.metrics.keys import keys
 from apex_lab.metrics.tracking import EVENT_TYPES
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from apex_lab.tables import spec
+from apex_lab.tables.asked import Tables, TablesConfig, assemble
 from apex_lab.tables.build import Built
 from apex_lab.tables.choose import Version
-from apex_lab.tables.command import Tables, TablesConfig, assemble
-from apex_lab.tables.commands import Command
 from apex_lab.tables.found import collect
+from apex_lab.tables.missing_runs import Command
 from apex_lab.tables.rows import Line
 
 SEGMENTATION = {"ari_fg": 0.5, "msc_fg": 0.4, "ari": 0.6, "msc": 0.7}

@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from apex_lab.tables.command import assemble
-from apex_lab.tables.commands import Command
+from apex_lab.tables.asked import assemble
 from apex_lab.tables.found import collect
+from apex_lab.tables.missing_runs import Command
 from tests.tables.folders import VERSION, job, made, run_folder
 
 

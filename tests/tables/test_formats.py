@@ -17,7 +17,7 @@ import pytest
 from apex_lab.base.files import write_json
 from apex_lab.tables import export, latex, markdown
 from apex_lab.tables.build import Built
-from apex_lab.tables.commands import Command
+from apex_lab.tables.missing_runs import Command
 from tests.tables.folders import made, run_folder
 
 VALUES = (0.1234567890123, 0.2, 0.9)

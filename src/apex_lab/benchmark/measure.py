@@ -15,7 +15,7 @@ from torch._dynamo.exc import TorchDynamoException
 from torch._dynamo.utils import counters
 
 from apex_lab.base.validation import one_line
-from apex_lab.benchmark.parts import PARTS
+from apex_lab.benchmark.profile import PARTS
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.schema import Config
 

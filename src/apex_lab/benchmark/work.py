@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
-from apex_lab.benchmark.parts import Clock, watched
+from apex_lab.benchmark.profile import Clock, watched
 from apex_lab.config.schema import Config, build_model, build_optimizer, build_schedules, build_weights
 from apex_lab.scene import SceneModel
 from apex_lab.training.learner import Learner, as_float

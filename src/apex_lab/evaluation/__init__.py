@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from apex_lab.evaluation.export import EXPORTS, Export, export_path
-from apex_lab.evaluation.parts import Parts, Tally
+from apex_lab.evaluation.partial import Parts, Tally
 from apex_lab.evaluation.pictures import PICTURES_BY
-from apex_lab.evaluation.record import COLUMNS, TRACKING_COLUMNS, summary
+from apex_lab.evaluation.results import COLUMNS, TRACKING_COLUMNS, summary
 from apex_lab.evaluation.score import Predictor, score
 from apex_lab.evaluation.scoring import OF_SCENES, ScoringPart
 from apex_lab.evaluation.whole import Asked, evaluate

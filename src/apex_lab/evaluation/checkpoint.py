@@ -21,8 +21,8 @@ from apex_lab.base.validation import one_line, sentence
 from apex_lab.config.schema import components
 from apex_lab.config.schema import schema as config
 from apex_lab.evaluation.export import export_path
-from apex_lab.evaluation.parts import Parts
-from apex_lab.evaluation.record import summary
+from apex_lab.evaluation.partial import Parts
+from apex_lab.evaluation.results import summary
 from apex_lab.evaluation.score import Predictor
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.evaluation.whole import Asked, evaluate

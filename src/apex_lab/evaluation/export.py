@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from torch.utils.data import Dataset
 
-from apex_lab.evaluation.parts import Tally
+from apex_lab.evaluation.partial import Tally
 from apex_lab.formats import PredictedVideo, open_writer
 
 Export = Literal["npz", "coco", "weis", "davis", "mots", "mot"]

@@ -11,10 +11,10 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import unwritable
 from apex_lab.base.progress import Meter
-from apex_lab.evaluation.record import summary
+from apex_lab.evaluation.results import summary
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.formats import score_predictions, write_result
-from apex_lab.formats.score import plain
+from apex_lab.formats.scored_files import plain
 from apex_lab.metrics import by_property
 
 

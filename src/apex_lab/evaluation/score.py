@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader, Dataset, Subset
 from apex_lab.base.errors import UserError
 from apex_lab.base.progress import Meter
 from apex_lab.base.validation import one_line
-from apex_lab.evaluation.parts import Parts, Tally
+from apex_lab.evaluation.partial import Parts, Tally
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.formats import p2d_video_name
 from apex_lab.metrics import ObjectMetadata, background_identities, p2d_metadata, scene_identities

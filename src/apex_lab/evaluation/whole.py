@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from apex_lab.evaluation import export as exports
-from apex_lab.evaluation import pictures, record
-from apex_lab.evaluation.parts import Parts
+from apex_lab.evaluation import pictures
+from apex_lab.evaluation import results as record
+from apex_lab.evaluation.partial import Parts
 from apex_lab.evaluation.pictures import PICTURES_BY
 from apex_lab.evaluation.score import Batches, Predictor, score
 from apex_lab.evaluation.scoring import ScoringPart

@@ -23,7 +23,7 @@ from apex_lab.formats.coco import CocoWriter
 from apex_lab.formats.davis import DavisWriter
 from apex_lab.formats.mot import MotWriter
 from apex_lab.formats.npz import NpzWriter
-from apex_lab.formats.score import score_predictions, write_result
+from apex_lab.formats.scored_files import score_predictions, write_result
 from apex_lab.formats.truth import open_truth, p2d_video_name
 from apex_lab.formats.video import PredictedVideo
 

@@ -11,10 +11,10 @@ from apex_lab.metrics.keys import KEYS
 from apex_lab.metrics.linking import link_frames
 from apex_lab.metrics.modules import AdjustedRandIndex, SceneMetrics, SegmentationCovering, SegmentationScore
 from apex_lab.metrics.objects import ObjectMetadata, by_property, p2d_metadata
-from apex_lab.metrics.record import EvaluatorSettings
 from apex_lab.metrics.scenes import background_identities, resize_masks, scene_identities
 from apex_lab.metrics.segmentation import ari, ari_fg, covering
 from apex_lab.metrics.tracking import TrackingSettings
+from apex_lab.metrics.video_record import EvaluatorSettings
 
 __all__ = [
     "KEYS",

@@ -18,8 +18,8 @@ from apex_lab.metrics.identity import IdentityCounts
 from apex_lab.metrics.keys import FRAME_SCORES, VIDEO_SCORES, Number, keys
 from apex_lab.metrics.linking import link_frames
 from apex_lab.metrics.objects import COLUMNS, ObjectMetadata
-from apex_lab.metrics.record import EvaluatorSettings, VideoRecord, score_video, tracking_values
 from apex_lab.metrics.tracking import EVENT_TYPES, TrackingCounts
+from apex_lab.metrics.video_record import EvaluatorSettings, VideoRecord, score_video, tracking_values
 
 MAX_IDENTITY = 2**53
 """Readers of JSON keep numbers as float64, which is exact up to here."""

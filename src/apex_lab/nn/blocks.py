@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import pixel_centres
+from apex_lab.nn.splitting import joined, part_size
 
 
 def group_norm(channels: int, per_group: int = 8) -> nn.GroupNorm:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from apex_lab.nn.blocks import conv_norm, group_norm
-from apex_lab.nn.parts import joined, part_size
+from apex_lab.nn.splitting import joined, part_size
 
 
 class ResidualBlock(nn.Module):

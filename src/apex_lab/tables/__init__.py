@@ -11,6 +11,6 @@ markdown, latex, export    the same tables as Markdown, LaTeX, JSON and CSV
 
 from __future__ import annotations
 
-from apex_lab.tables.command import main
+from apex_lab.tables.asked import main
 
 __all__ = ["main"]

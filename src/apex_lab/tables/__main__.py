@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from apex_lab.tables.command import main
+from apex_lab.tables.asked import main
 
 if __name__ == "__main__":
     main()

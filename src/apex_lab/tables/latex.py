@@ -7,7 +7,7 @@ import unicodedata
 from collections.abc import Sequence
 
 from apex_lab.tables.build import Built
-from apex_lab.tables.commands import Command
+from apex_lab.tables.missing_runs import Command
 from apex_lab.tables.rows import TRACKING, Cell, Line, rounded
 from apex_lab.tables.spec import Column
 

@@ -11,8 +11,8 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from apex_lab.nn.blocks import GlimpseEncoder
-from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import crop
+from apex_lab.nn.splitting import joined, part_size
 
 Size = Annotated[int, Field(ge=4, le=128)]
 Count = Annotated[int, Field(gt=0)]

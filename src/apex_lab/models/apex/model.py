@@ -31,8 +31,8 @@ from apex_lab.models.apex.slots import carry, gather_slots
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
 from apex_lab.nn.distributions import kl_gaussian
-from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import Paster
+from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import ABSENT, Scene, SceneModel, Schedule
 
 Count = Annotated[int, Field(gt=0)]

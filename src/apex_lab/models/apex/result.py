@@ -12,7 +12,7 @@ from torch import Tensor
 from apex_lab.models.apex.rollout import Step
 from apex_lab.models.apex.slots import gather_slots
 from apex_lab.models.apex.windows import window_of
-from apex_lab.nn.parts import joined
+from apex_lab.nn.splitting import joined
 from apex_lab.scene import Scene
 
 BACKGROUND_ID = 0

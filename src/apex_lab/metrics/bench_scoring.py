@@ -1,4 +1,4 @@
-"""`python -m apex_lab.metrics.bench`: how long every metric of a test set takes, with the time of each part.
+"""`python -m apex_lab.metrics.bench_scoring`: how long every metric of a test set takes, with the time of each part.
 
 The videos are synthetic: discs that move over a background, and predictions that split, merge, lose and rename them.
 """
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Int64
 
 from apex_lab.metrics.evaluator import Evaluator
-from apex_lab.metrics.record import EvaluatorSettings
+from apex_lab.metrics.video_record import EvaluatorSettings
 
 
 def synthetic_video(

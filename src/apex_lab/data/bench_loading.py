@@ -1,4 +1,4 @@
-"""How fast P2D loads: `python -m apex_lab.data.bench DIR`, in frames per second.
+"""How fast P2D loads: `python -m apex_lab.data.bench_loading DIR`, in frames per second.
 
 Compare with the frames per second that a model consumes in training: loading should be ten times as fast or more.
 """
@@ -35,7 +35,9 @@ def frames_per_second(data: P2D, batch_size: int, workers: int, seconds: float) 
 
 def main() -> int:
     """Prints one line per number of loading processes."""
-    parser = argparse.ArgumentParser(prog="python -m apex_lab.data.bench", description="Measures how fast P2D loads.")
+    parser = argparse.ArgumentParser(
+        prog="python -m apex_lab.data.bench_loading", description="Measures how fast P2D loads."
+    )
     parser.add_argument("dir", type=Path, help="folder made by python -m sims.p2d")
     parser.add_argument("--split", default="train")
     parser.add_argument("--batch-size", type=int, default=4)

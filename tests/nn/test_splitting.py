@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from apex_lab.config.schema import build_model, build_schedules
-from apex_lab.nn import parts
-from apex_lab.nn.parts import joined, part_size
+from apex_lab.nn import splitting as parts
+from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import schedule_at
 from tests.conftest import compose_job
 

@@ -31,8 +31,8 @@ from apex_lab.runs.folder import provenance
 from apex_lab.tables import export, latex, markdown, spec
 from apex_lab.tables.build import Built, build
 from apex_lab.tables.choose import Choice, Version, choose
-from apex_lab.tables.commands import Command, missing_runs
 from apex_lab.tables.found import SeedRun, collect
+from apex_lab.tables.missing_runs import Command, missing_runs
 from apex_lab.tables.rows import Options
 
 GROUPS = ("data", "scale", "paths")

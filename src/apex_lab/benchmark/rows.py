@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from apex_lab.benchmark.parts import PARTS
+from apex_lab.benchmark.profile import PARTS
 
 Row = Mapping[str, Any]
 

@@ -10,9 +10,9 @@ from typing import Any
 import pandas as pd
 
 from apex_lab.base.files import make_folder, read_json, write_json, write_text
-from apex_lab.evaluation.parts import Tally
+from apex_lab.evaluation.partial import Tally
 from apex_lab.evaluation.pictures import Chosen
-from apex_lab.formats.score import plain
+from apex_lab.formats.scored_files import plain
 from apex_lab.metrics import by_property
 
 COLUMNS = {"ari_fg": "ARI-FG", "msc_fg": "MSC-FG", "ari": "ARI", "msc": "MSC"}
