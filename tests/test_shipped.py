@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from apex_lab.config.schema import build_model, check_job
-from apex_lab.runs.folder import checkpoints
+from apex_lab.runs import checkpoints
 from apex_lab.scene import schedule_at
 from tests.conftest import REPOSITORY
 

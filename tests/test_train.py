@@ -18,7 +18,7 @@ import pytest
 import torch
 from filelock import FileLock
 
-from apex_lab.runs.folder import checkpoints
+from apex_lab.runs import checkpoints
 from apex_lab.train import main
 from tests.conftest import REPOSITORY, TINY, Ended
 

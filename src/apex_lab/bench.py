@@ -25,11 +25,12 @@ from apex_lab.benchmark import rows as report
 from apex_lab.benchmark.child import in_child
 from apex_lab.benchmark.compare import Comparison, compare
 from apex_lab.benchmark.measure import Case, Mode, measure
+from apex_lab.config import command_line as cli
 from apex_lab.config.schema import Config, Job, build_model, check_job
-from apex_lab.config.schema import command_line as cli
 from apex_lab.config.schema import device as device_of
 from apex_lab.models.apex import Apex
-from apex_lab.runs.folder import group_name, provenance
+from apex_lab.runs import provenance
+from apex_lab.runs.folder import group_name
 
 
 class BenchPart(BaseModel):

@@ -17,8 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, sentence, shown, validate
-from apex_lab.config.schema import command_line as cli
-from apex_lab.config.schema import schema as config
+from apex_lab.config import command_line as cli
+from apex_lab.config import schema as config
 from apex_lab.evaluation import OF_SCENES, Export, ScoringPart
 from apex_lab.evaluation.checkpoint import Request, evaluate_checkpoint, find, load
 from apex_lab.evaluation.others import Predictions, check_output, output_of, score_others

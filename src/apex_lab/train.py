@@ -19,6 +19,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.interrupts import Deferred, Interrupted, deferring
 from apex_lab.base.validation import one_line
+from apex_lab.config import command_line as cli
 from apex_lab.config.schema import (
     Job,
     build_lr_scale,
@@ -29,9 +30,9 @@ from apex_lab.config.schema import (
     check_job,
     components,
 )
-from apex_lab.config.schema import command_line as cli
 from apex_lab.config.schema import device as device_of
-from apex_lab.runs.folder import Run, checkpoints, fingerprint, group_name
+from apex_lab.runs import checkpoints
+from apex_lab.runs.folder import Run, fingerprint, group_name
 from apex_lab.scene import SceneModel, schedule_at
 from apex_lab.training import callbacks, estimate
 from apex_lab.training.learner import Learner, Stretches

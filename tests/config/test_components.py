@@ -13,7 +13,7 @@ from torch import Tensor
 from apex_lab.base.errors import UserError
 from apex_lab.config.components import build, check
 
-HERE = "tests.test_components"
+HERE = "tests.config.test_components"
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from apex_lab.base.errors import UserError
-from apex_lab.runs.folder import checkpoints
+from apex_lab.runs import checkpoints
 
 
 def content(step: int = 3) -> dict[str, Any]:

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
-from apex_lab.config.schema import schema as config
-from apex_lab.runs.folder import folder as runs
+from apex_lab.config import schema as config
+from apex_lab.runs import folder as runs
 from tests.conftest import Ended
 from tests.tables.folders import run_folder
 

@@ -7,6 +7,7 @@ import torch
 
 from apex_lab.config.schema import build_model
 from apex_lab.scene import Scene, Schedule
+from apex_lab.base import progress
 from apex_lab.training import estimate
 from tests.conftest import compose_job
 from tests.tiny import Layers
@@ -61,4 +62,4 @@ def test_only_what_is_long_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_durations_are_readable(seconds: float, words: str) -> None:
-    assert estimate.readable(seconds) == words
+    assert progress.readable(seconds) == words

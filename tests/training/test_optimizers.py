@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from apex_lab.base.errors import UserError
-from apex_lab.config.schema import components
+from apex_lab.config import components
 from apex_lab.training.optimizers import QUINTIC, Muon, all_orthogonalised, is_matrix, orthogonalised
 
 

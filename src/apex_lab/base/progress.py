@@ -10,7 +10,6 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from apex_lab.base import console
-from apex_lab.training.estimate import readable
 
 
 class Meter:
@@ -61,3 +60,11 @@ class Meter:
             left = (self._told - self._began) / max(done - self._first, 1) * (self._total - done)
             parts = [f"{self._title} {done} of {self._total}", *([note] if note else []), f"{readable(left)} left"]
             console.say(", ".join(parts))
+
+
+def readable(seconds: float) -> str:
+    """A duration in the unit a person would use."""
+    for size, unit in ((86400.0, "days"), (3600.0, "hours"), (60.0, "minutes")):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.1f} {unit}" if seconds < 10 * size else f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} seconds"

@@ -15,8 +15,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
+from apex_lab.config import components
 from apex_lab.config.components import is_node
-from apex_lab.config.schema import components
 from apex_lab.metrics.modules import PAPER_SCORES
 from apex_lab.scene import SceneModel
 from apex_lab.training.schedules import Constant
@@ -28,7 +28,7 @@ def conf_dir() -> Path:
     Raises:
         UserError: neither is there (a damaged installation).
     """
-    package = Path(__file__).resolve().parent
+    package = Path(__file__).resolve().parent.parent
     for folder in (package / "conf", package.parent.parent / "conf"):
         if (folder / "train.yaml").is_file():
             return folder

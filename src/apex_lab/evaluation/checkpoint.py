@@ -18,8 +18,8 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, read_json
 from apex_lab.base.validation import one_line, sentence
-from apex_lab.config.schema import components
-from apex_lab.config.schema import schema as config
+from apex_lab.config import components
+from apex_lab.config import schema as config
 from apex_lab.evaluation.export import export_path
 from apex_lab.evaluation.partial import Parts
 from apex_lab.evaluation.results import summary
@@ -27,7 +27,7 @@ from apex_lab.evaluation.score import Predictor
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.evaluation.whole import Asked, evaluate
 from apex_lab.metrics.evaluator import versions
-from apex_lab.runs.folder import checkpoints, provenance
+from apex_lab.runs import checkpoints, provenance
 from apex_lab.scene import SceneModel, schedule_at
 
 

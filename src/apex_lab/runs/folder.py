@@ -29,7 +29,7 @@ from filelock import FileLock, Timeout
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, read_json, write_json, write_text
 from apex_lab.config.schema import Job
-from apex_lab.runs.folder import provenance
+from apex_lab.runs import provenance
 
 HARMLESS = (
     "seed",

@@ -24,10 +24,10 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json, write_text
 from apex_lab.base.validation import shown, validate
-from apex_lab.config.schema import command_line as cli
-from apex_lab.config.schema import schema as config
-from apex_lab.runs.folder import folder as runs
-from apex_lab.runs.folder import provenance
+from apex_lab.config import command_line as cli
+from apex_lab.config import schema as config
+from apex_lab.runs import folder as runs
+from apex_lab.runs import provenance
 from apex_lab.tables import export, latex, markdown, spec
 from apex_lab.tables.build import Built, build
 from apex_lab.tables.choose import Choice, Version, choose

@@ -12,7 +12,8 @@ from pydantic import Field
 from apex_lab.base import console
 from apex_lab.base.interrupts import Deferred
 from apex_lab.base.progress import Meter
-from apex_lab.runs.folder import Run, checkpoints
+from apex_lab.runs import checkpoints
+from apex_lab.runs.folder import Run
 from apex_lab.training.learner import Learner
 
 

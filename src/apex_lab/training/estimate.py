@@ -7,6 +7,7 @@ import time
 
 import torch
 
+from apex_lab.base.progress import readable
 from apex_lab.config.schema import Config, build_schedules, build_weights
 from apex_lab.scene import SceneModel, schedule_at
 
@@ -50,11 +51,3 @@ def seconds_on_cpu(config: Config, model: SceneModel) -> float:
             torch.stack([terms[name].sum() * weight for name, weight in weights.items()]).sum().backward()
             seconds = time.perf_counter() - began
     return seconds / frames * config.data["frames"] * config.data["batch_size"] * config.trainer.max_steps
-
-
-def readable(seconds: float) -> str:
-    """A duration in the unit a person would use."""
-    for size, unit in ((86400.0, "days"), (3600.0, "hours"), (60.0, "minutes")):
-        if seconds >= 2 * size:
-            return f"{seconds / size:.1f} {unit}" if seconds < 10 * size else f"{seconds / size:.0f} {unit}"
-    return f"{seconds:.0f} seconds"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from apex_lab.config.schema import components
+from apex_lab.config import components
 from tests.models.apex.small import resolved
 
 
