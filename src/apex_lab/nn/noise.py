@@ -13,10 +13,10 @@ from apex_lab.scene import Noise
 Draw = Callable[..., Tensor]
 
 
-def mixed(*parts: int) -> int:
+def mixed(first: int, *parts: int) -> int:
     """A generator seed in [0, 2^63) from several integers; neighbouring integers give unrelated seeds (splitmix64)."""
     mask = 2**64 - 1
-    value = 0
+    value = first
     for part in parts:
         value = (value * 0x9E3779B97F4A7C15 + part + 1) & mask
         for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
