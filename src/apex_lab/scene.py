@@ -1,4 +1,5 @@
-"""The contract between models and everything else: `SceneModel` (what a model is) and `Scene` (what it says).
+"""The contract between models and everything else: `SceneModel` (a model), `Context` (its input besides pixels) and
+`Scene` (its output).
 
 Legend used across the package: B videos, T frames, K components, P propagated slots, D discovery cells,
 H, W image height and width, A length of the appearance vector.
@@ -6,8 +7,10 @@ H, W image height and width, A length of the appearance vector.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Integer
@@ -20,9 +23,52 @@ Schedule = Mapping[str, Tensor]
 """Values that depend on training progress (temperature, prior, ...), evaluated at one step: name -> 0-dim tensor."""
 
 
+class Noise:
+    """Source of random numbers for a forward pass; this one draws from PyTorch's default generator.
+
+    The first dimension of `like` is the batch of videos, or the batch flattened with dimensions that follow it (time,
+    slots), videos slowest: B, B T, B K, B T K, ... Then training noise can be a function of the position of a video in
+    the global batch, and evaluation noise a function of the video (`apex_lab.nn.noise`).
+    """
+
+    def normal(self, like: Tensor) -> Tensor:
+        """Standard normal numbers in the shape, type and device of `like`."""
+        return torch.randn_like(like)
+
+    def uniform(self, like: Tensor) -> Tensor:
+        """Uniform numbers in [0, 1) in the shape, type and device of `like`."""
+        return torch.rand_like(like)
+
+    def at(self, frame: int, frames: int = 1) -> Noise:
+        """The noise of `frames` frames from `frame` on, counted from the first frame of the pass.
+
+        A model that samples in evaluation draws frame by frame through this, so that a video cut into chunks gets the
+        same numbers as a whole one: `noise.at(t).normal(like)` in the loop over time, or `noise.at(0, T).normal(like)`
+        with `like` (B T, ...) for all frames at once.
+        """
+        return self
+
+
+@dataclass(frozen=True)
+class Context:
+    """Everything that a forward pass needs besides pixels.
+
+    Attributes:
+        schedule: scheduled values at this step, name -> 0-dim tensor on the model's device.
+        noise: random numbers.
+        state: `Scene.state` of the frames before; None at the start of a video.
+        detail: fill `Scene.windows`, `Scene.means` and other costly fields.
+    """
+
+    schedule: Schedule = field(default_factory=dict)
+    noise: Noise = field(default_factory=Noise)
+    state: Any = None
+    detail: bool = False
+
+
 @dataclass(frozen=True)
 class Scene:
-    """What a model says about a batch of videos.
+    """The output of a model for a batch of videos.
 
     Attributes:
         masks: soft masks in [0, 1], sum to 1 over K at every pixel; an absent component's mask is zero.
@@ -30,15 +76,16 @@ class Scene:
         ids: the same number is the same object over time; `ABSENT` (-1) where a component holds nothing. A background
             component has an id of its own. Ids need only be unique within a video.
         presence: in [0, 1].
-        appearance: what the arrangement task matches by (z_what).
+        appearance: what the arrangement task matches by (z_what, or the slot).
         reconstruction: RGB in [0, 1].
         terms: loss terms, one value per video (summed over its frames), each under its own name; the objective to
             minimise is their weighted sum.
         windows: z_where per component as (s_y, s_x, t_y, t_x): size as a share of the image side, centre in [-1, 1];
-            NaN where a component has no window. None for models without windows.
-        means: each component's own RGB picture in [0, 1], before masking; None where a model has none or where it was
-            not asked for.
+            NaN where a component has no window. None for models without windows, and without `Context.detail`.
+        means: each component's own RGB image in [0, 1], before masking; None for models without, and without
+            `Context.detail`.
         diagnostics: name -> 0-dim tensor worth a curve (live objects, mean window size, ...); never part of the loss.
+        state: `Context.state` for the next chunk of the same videos; None for models of single images.
     """
 
     masks: Float[Tensor, "B T K H W"]
@@ -51,6 +98,7 @@ class Scene:
     windows: Float[Tensor, "B T K 4"] | None = None
     means: Float[Tensor, "B T K 3 H W"] | None = None
     diagnostics: dict[str, Tensor] = field(default_factory=dict)
+    state: Any = None
 
     def segmentation(self, min_presence: float = 0.5) -> Int[Tensor, "B T H W"]:
         """Identity of the winning component at every pixel (metrics.md sections 0 and 2.4).
@@ -65,11 +113,35 @@ class Scene:
         return ids.gather(2, winner[:, :, None]).squeeze(2)
 
 
+class Statistics:
+    """Statistics of the training videos, each computed when it is asked for.
+
+    Args:
+        median: computes the per-pixel median image.
+    """
+
+    def __init__(self, median: Callable[[], Float[Tensor, "3 H W"]]) -> None:
+        self._median = median
+
+    @cached_property
+    def median(self) -> Float[Tensor, "3 H W"]:
+        """Per-pixel median of the training frames, RGB in [0, 1], at the model's input size."""
+        return self._median()
+
+
 class SceneModel(nn.Module):
     """A plain module from videos to a `Scene`: knows no trainer, logger, file or step counter.
 
-    In training mode latents are sampled; in evaluation mode the result is deterministic.
+    In training mode latents are sampled. In evaluation mode the result is a function of the weights, the video and
+    `Context.noise`. Gradients may be off (`no_grad`, never `inference_mode`): a model that differentiates inside its
+    inference opens `torch.enable_grad` itself.
     """
+
+    term_names: ClassVar[tuple[str, ...]] = ()
+    """Names of the loss terms in `Scene.terms`."""
+
+    schedule_ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
+    """Scheduled values that `forward` reads: name -> smallest and largest allowed value."""
 
     needs_training: bool = True
     """False for models that have nothing to learn by gradient (the classical yardsticks)."""
@@ -77,24 +149,27 @@ class SceneModel(nn.Module):
     tracks: bool = True
     """False for models of single images, whose ids mean nothing from one frame to the next: no tracking scores."""
 
+    streams: bool = True
+    """False for models that need the whole video at once: `Context.state` is not supported."""
+
     needs_labels: bool = False
     """True for models that read the ground truth (the oracle): `from_labels` takes the place of `forward`."""
 
     has_posterior: bool = False
-    """True for models whose likelihood is a mixture over components, so that `posterior` can be asked."""
+    """True for models whose likelihood is a mixture over components, so that `posterior` can be called."""
 
-    def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
-        """Called once before training starts from scratch, with the training set's per-pixel median in [0, 1].
+    input_size: tuple[int, int] | None = None
+    """(H, W) in pixels for a model built for one size: videos are resized to it, masks back. None: any size."""
 
-        The default ignores it.
-        """
+    def initialise(self, statistics: Statistics) -> None:
+        """Called once before training starts from scratch. The default does nothing."""
 
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
-        """RGB video in [0, 1] and the scheduled values at this step -> `Scene`."""
-        raise TypeError(f"{type(self).__name__} does not define forward(video, schedule)")
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
+        """RGB video in [0, 1] -> `Scene`."""
+        raise TypeError(f"{type(self).__name__} does not define forward(video, context)")
 
     def posterior(
-        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], schedule: Schedule
+        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], context: Context
     ) -> Float[Tensor, "B T K H W"]:
         """How likely each component is to have drawn each pixel, given the pixel; sums to 1 over K.
 
@@ -102,17 +177,17 @@ class SceneModel(nn.Module):
         responsibilities).
 
         Args:
-            scene: of this video, from this model in evaluation mode.
+            scene: of this video, from this model in evaluation mode, with `Context.detail`.
             video: RGB in [0, 1].
-            schedule: as it was for the scene.
+            context: as it was for the scene.
         """
         raise TypeError(f"{type(self).__name__} has no mixture likelihood, so no posterior over components")
 
     def from_labels(self, video: Float[Tensor, "B T 3 H W"], segmentation: Integer[Tensor, "B T H W"]) -> Scene:
         """RGB video in [0, 1] and its ground truth -> `Scene`; called in place of `forward` where `needs_labels`."""
-        raise TypeError(f"{type(self).__name__} does not read the ground truth: call forward(video, schedule)")
+        raise TypeError(f"{type(self).__name__} does not read the ground truth: call forward(video, context)")
 
 
 def schedule_at(values: Mapping[str, float], device: torch.device | str = "cpu") -> dict[str, Tensor]:
-    """Wraps plain numbers as the 0-dim tensors that `SceneModel.forward` takes."""
+    """Wraps plain numbers as the 0-dim tensors of `Context.schedule`."""
     return {name: torch.tensor(float(value), device=device) for name, value in values.items()}

@@ -9,6 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from apex_lab.scene import Noise
+
 
 class Gaussian(NamedTuple):
     """A diagonal Gaussian: mean and standard deviation, both (..., D)."""
@@ -16,9 +18,9 @@ class Gaussian(NamedTuple):
     mean: Tensor
     std: Tensor
 
-    def sample(self, stochastic: bool) -> Tensor:
-        """Reparameterised sample, or the mean."""
-        return self.mean + self.std * torch.randn_like(self.mean) if stochastic else self.mean
+    def sample(self, noise: Noise | None) -> Tensor:
+        """Reparameterised sample; without noise the mean."""
+        return self.mean if noise is None else self.mean + self.std * noise.normal(self.mean)
 
 
 def gaussian_from(raw: Float[Tensor, "... two_D"], min_std: float = 1e-3, max_std: float = 5.0) -> Gaussian:
@@ -48,8 +50,10 @@ def kl_bernoulli(q: Float[Tensor, "..."], p: Float[Tensor, "..."], tiny: float =
     return q * (q.log() - p.log()) + (1 - q) * ((-q).log1p() - (-p).log1p())
 
 
-def relaxed_bernoulli(prob: Float[Tensor, "..."], temperature: Tensor, tiny: float = 1e-6) -> Float[Tensor, "..."]:
+def relaxed_bernoulli(
+    prob: Float[Tensor, "..."], temperature: Tensor, noise: Noise, tiny: float = 1e-6
+) -> Float[Tensor, "..."]:
     """Reparameterised sample of the binary Gumbel-softmax (concrete) distribution with P(z > 0.5) = prob."""
     prob = prob.clamp(tiny, 1 - tiny)
-    u = torch.rand_like(prob).clamp(tiny, 1 - tiny)
+    u = noise.uniform(prob).clamp(tiny, 1 - tiny)
     return torch.sigmoid((prob.log() - (-prob).log1p() + u.log() - (-u).log1p()) / temperature)
