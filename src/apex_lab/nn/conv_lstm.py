@@ -26,17 +26,23 @@ class ConvLSTM(nn.Module):
             assert self.from_input.bias is not None
             self.from_input.bias[channels : 2 * channels] = 1.0
 
-    def forward(self, features: Float[Tensor, "B T C h w"]) -> Float[Tensor, "B T C h w"]:
-        """Hidden states of all frames, from a zero state before the first."""
+    def forward(
+        self, features: Float[Tensor, "B T C h w"], state: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Float[Tensor, "B T C h w"], tuple[Tensor, Tensor]]:
+        """Hidden states of all frames, and hidden state and cell, each (B, C, h, w), after the last.
+
+        Args:
+            features: of the frames.
+            state: hidden state and cell before the first frame; None: zero.
+        """
         b, t = features.shape[:2]
         driven = self.from_input(features.flatten(0, 1)).unflatten(0, (b, t))
-        hidden = torch.zeros_like(features[:, 0])
-        cell = torch.zeros_like(hidden)
+        hidden, cell = (torch.zeros_like(features[:, 0]) for _ in range(2)) if state is None else state
         states = []
         for frame in driven.unbind(1):
             hidden, cell = self.step(frame, hidden, cell)
             states.append(hidden)
-        return torch.stack(states, dim=1)
+        return torch.stack(states, dim=1), (hidden, cell)
 
     def step(
         self, driven: Float[Tensor, "B C4 h w"], hidden: Float[Tensor, "B C h w"], cell: Float[Tensor, "B C h w"]

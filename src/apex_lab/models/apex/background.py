@@ -80,9 +80,14 @@ class Background(nn.Module):
         """q(z_bg | m_bg, x), the first factor of Eq. 14: a CNN on the background mask and the image."""
         return gaussian_from(self.encoder(torch.cat([mask[:, None], image], dim=1)))
 
-    def prior(self, z: Float[Tensor, "B T Z"]) -> Gaussian:
-        """p(z_bg_t | z_bg_{t-1}) for every frame, the first factor of Eq. 4; N(0, 1) at the first."""
-        first = standard_normal(z[:, :1])
+    def prior(self, z: Float[Tensor, "B T Z"], before: Float[Tensor, "B Z"] | None = None) -> Gaussian:
+        """p(z_bg_t | z_bg_{t-1}) for every frame, the first factor of Eq. 4.
+
+        Args:
+            z: of the frames.
+            before: of the frame before the first one; None where there is none, and the prior is N(0, 1).
+        """
+        first = standard_normal(z[:, :1]) if before is None else gaussian_from(self.transition(before[:, None]))
         later = gaussian_from(self.transition(z[:, :-1]))
         return Gaussian(*(torch.cat([a, b], dim=1) for a, b in zip(first, later, strict=True)))
 

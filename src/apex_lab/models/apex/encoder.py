@@ -45,7 +45,13 @@ class ApexEncoder(nn.Module):
         centred = images - 0.5
         return self.dla(centred) + self.colour(F.avg_pool2d(centred, self.stride))
 
-    def forward(self, video: Float[Tensor, "B T 3 H W"]) -> Float[Tensor, "B T F H/4 W/4"]:
-        """RGB in [0, 1] -> features; the DLA sees all B T frames as one batch."""
+    def forward(
+        self, video: Float[Tensor, "B T 3 H W"], state: tuple[Tensor, Tensor] | None = None
+    ) -> tuple[Float[Tensor, "B T F H/4 W/4"], tuple[Tensor, Tensor]]:
+        """RGB in [0, 1] -> features, and the ConvLSTM's state after the last frame.
+
+        The DLA sees all B T frames as one batch.
+        """
         frames = self.of_images(video.flatten(0, 1)).unflatten(0, video.shape[:2])
-        return frames + self.over_time(frames)
+        hidden, state = self.over_time(frames, state)
+        return frames + hidden, state

@@ -44,8 +44,19 @@ class Glimpses(nn.Module, ABC):
         """Channels of the sources of glimpses and of propagation crops."""
 
     @abstractmethod
-    def sources(self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]) -> tuple[Tensor, Tensor]:
-        """What glimpses and propagation crops are cut from, each (B, T, C, h, w)."""
+    def sources(
+        self,
+        video: Float[Tensor, "B T 3 H W"],
+        features: Float[Tensor, "B T F h w"],
+        before: Float[Tensor, "B 3 H W"] | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """What glimpses and propagation crops are cut from, each (B, T, C, h, w).
+
+        Args:
+            video: RGB in [0, 1].
+            features: of its frames.
+            before: the frame before the first one; None where there is none.
+        """
 
     def look(self, source: Float[Tensor, "B C h w"], window: Float[Tensor, "B K 4"]) -> Float[Tensor, "B K code"]:
         """Codes of the glimpses (z_what's evidence)."""
@@ -72,7 +83,12 @@ class FeatureGlimpses(Glimpses):
         """F for both."""
         return features, features
 
-    def sources(self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]) -> tuple[Tensor, Tensor]:
+    def sources(
+        self,
+        video: Float[Tensor, "B T 3 H W"],
+        features: Float[Tensor, "B T F h w"],
+        before: Float[Tensor, "B 3 H W"] | None = None,
+    ) -> tuple[Tensor, Tensor]:
         """The feature maps themselves."""
         return features, features
 
@@ -86,8 +102,13 @@ class ImageGlimpses(Glimpses):
         """RGB; RGB of two frames."""
         return 3, 6
 
-    def sources(self, video: Float[Tensor, "B T 3 H W"], features: Float[Tensor, "B T F h w"]) -> tuple[Tensor, Tensor]:
-        """x_t, and [x_t, x_{t-1}] (the first frame is its own predecessor)."""
+    def sources(
+        self,
+        video: Float[Tensor, "B T 3 H W"],
+        features: Float[Tensor, "B T F h w"],
+        before: Float[Tensor, "B 3 H W"] | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """x_t, and [x_t, x_{t-1}] (a video's first frame is its own predecessor)."""
         centred = video - 0.5
-        before = torch.cat([centred[:, :1], centred[:, :-1]], dim=1)
-        return centred, torch.cat([centred, before], dim=2)
+        first = centred[:, :1] if before is None else before[:, None] - 0.5
+        return centred, torch.cat([centred, torch.cat([first, centred[:, :-1]], dim=1)], dim=2)

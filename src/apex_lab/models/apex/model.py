@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, ClassVar
 
 import torch
@@ -26,20 +27,18 @@ from apex_lab.models.apex.objects import (
     scope_in_windows,
 )
 from apex_lab.models.apex.result import Drawn, Picture, scene_of, video_of
-from apex_lab.models.apex.rollout import Frame, Step, frames_of, stack_steps
+from apex_lab.models.apex.rollout import Frame, Memory, State, Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import carry, gather_slots
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
 from apex_lab.nn.distributions import kl_gaussian
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.nn.splitting import joined, part_size
-from apex_lab.scene import ABSENT, Scene, SceneModel, Schedule
+from apex_lab.scene import Context, Noise, Scene, SceneModel, Schedule, Statistics
 
 Count = Annotated[int, Field(gt=0)]
 Share = Annotated[float, Field(gt=0, lt=1)]
 Positive = Annotated[float, Field(gt=0)]
-
-FIRST_ID = 1
 
 
 class Apex(SceneModel):
@@ -74,7 +73,6 @@ class Apex(SceneModel):
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
-    schedule_names = ("temperature", "discovery_presence", "carry", "discover", "sigma_fg_scale", "sigma_bg_scale")
     schedule_ranges: ClassVar = {
         "temperature": (0.01, 100.0),
         "discovery_presence": (0.0, 1.0),
@@ -83,7 +81,6 @@ class Apex(SceneModel):
         "sigma_fg_scale": (0.01, 100.0),
         "sigma_bg_scale": (0.01, 100.0),
     }
-    """Smallest and largest value that each schedule may take in a run."""
 
     def __init__(
         self,
@@ -117,6 +114,7 @@ class Apex(SceneModel):
                 f"model.image_size={image_size} must be a multiple of 32, its quarter one of model.grid={grid}"
             )
         self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
+        self.input_size = (image_size, image_size)
         self.render_top = min(render_top or grid**2, grid**2)
         self.has_posterior = isinstance(likelihood, MixtureLikelihood)
         self.direction, self.keep_threshold = kl, keep_threshold
@@ -134,16 +132,18 @@ class Apex(SceneModel):
         self.glimpses.build(encoder.features, hidden)
         self.mask_decoder.start_at(start_mask)
 
-    def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
-        """Starts the background at the training set's median."""
-        self.background.initialise(median)
+    def initialise(self, statistics: Statistics) -> None:
+        """Starts the background at the training set's median, if it has a bias image."""
+        if self.background.bias_image is not None:
+            self.background.initialise(statistics.median)
 
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
         """Explains a video.
 
         Args:
             video: RGB in [0, 1].
-            schedule: `temperature` of the relaxed Bernoulli; `discovery_presence` p0; `carry`, the probability in
+            context: its schedule holds `temperature` of the relaxed Bernoulli; `discovery_presence` p0; `carry`, the
+                probability in
                 [0, 1] with which a video's objects are carried into the next frame in training (see `_carried_on`);
                 `discover`, the probability in [0, 1] with which a carried video may discover too (see `_may_discover`);
                 `sigma_fg_scale` and `sigma_bg_scale`, what the likelihood's sigmas are multiplied by. A wide sigma_bg:
@@ -153,27 +153,34 @@ class Apex(SceneModel):
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
-        features = self.encoder(video)
-        look_at, follow_in = self.glimpses.sources(video, features)
-        proposals = self.discovery(features, look_at, self.glimpses, self.appearance, self.training)
-        steps = self._roll_out(look_at, follow_in, proposals, schedule)
-        return self._explain(video, proposals, steps, schedule)
+        before: State | None = context.state
+        noise = context.noise if self.training else None
+        features, encoder = self.encoder(video, None if before is None else before.encoder)
+        look_at, follow_in = self.glimpses.sources(video, features, None if before is None else before.frame)
+        proposals = self.discovery(features, look_at, self.glimpses, self.appearance, noise)
+        memory = (
+            Memory.empty(len(video), self.max_objects, proposals.what.shape[-1], self.hidden, proposals.what)
+            if before is None
+            else before.memory
+        )
+        steps, memory = self._roll_out(look_at, follow_in, proposals, memory, context.schedule, noise)
+        return self._explain(video, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z))
 
     def posterior(
-        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], schedule: Schedule
+        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], context: Context
     ) -> Float[Tensor, "B T K H W"]:
         """Responsibilities of the objects carried on and the background under Eq. 1; see `SceneModel.posterior`."""
         if not isinstance(self.likelihood, MixtureLikelihood):
-            return super().posterior(scene, video, schedule)
+            return super().posterior(scene, video, context)
         if scene.means is None:
-            raise ValueError("the scene has no means: posterior is for scenes of a model in evaluation mode")
+            raise ValueError("the scene has no means: give Context(detail=True) for scenes whose posterior is wanted")
         found = self.likelihood.responsibilities(
             video.flatten(0, 1),
             scene.masks.flatten(0, 1).float(),
             scene.means.flatten(0, 1).float(),
             scene.background,
-            schedule["sigma_fg_scale"],
-            schedule["sigma_bg_scale"],
+            context.schedule["sigma_fg_scale"],
+            context.schedule["sigma_bg_scale"],
         )
         return found.unflatten(0, video.shape[:2])
 
@@ -184,19 +191,22 @@ class Apex(SceneModel):
     def _paster(self, place: Float[Tensor, "*batch 4"], glimpse: int) -> Paster:
         return Paster(window_of(place), glimpse, self.image_size)
 
-    def _roll_out(self, look_at: Tensor, follow_in: Tensor, proposals: Proposals, schedule: Schedule) -> Step:
+    def _roll_out(
+        self,
+        look_at: Tensor,
+        follow_in: Tensor,
+        proposals: Proposals,
+        memory: Memory,
+        schedule: Schedule,
+        noise: Noise | None,
+    ) -> tuple[Step, Memory]:
         """The part that depends on the frame before, frame by frame (Eq. 2, which is Eq. 13).
 
         Within a frame (Eq. 14): propagated objects, then discovered ones; the background, whose posterior needs the
         masks of both, is left to `_explain`.
         """
-        b, slots = len(look_at), self.max_objects
-        state = Objects.empty(b, slots, proposals.what.shape[-1], self.hidden, proposals.what)
-        valid = torch.zeros(b, slots, dtype=torch.bool, device=look_at.device)
-        ids = torch.full((b, slots), ABSENT, device=look_at.device)
-        next_id = torch.full((b,), FIRST_ID, device=look_at.device)
+        state, valid, ids, next_id, carried_on = memory
         frames = frames_of(look_at, follow_in, proposals, self._alpha(proposals.what))
-        carried_on = torch.zeros(b, 1, dtype=torch.bool, device=look_at.device)
         steps = []
         for frame in frames:
             before, beliefs = self.propagation(
@@ -207,17 +217,17 @@ class Apex(SceneModel):
                 frame.follow_in,
                 valid,
                 schedule["temperature"],
-                self.training,
+                noise,
             )
             alpha = self._alpha(before.what)
             scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
 
-            open_ = self._may_discover(carried_on, schedule).to(scope.dtype)
+            open_ = self._may_discover(carried_on, schedule, noise).to(scope.dtype)
             context, unexplained = self._context(frame, scope)
             prob = frame.prob * context * open_  # Eq. 17
             # Eq. 6: the prior of a discovery's presence, given the propagated objects
             prior = schedule["discovery_presence"] * unexplained * open_
-            pres = sample_presence(prob, schedule["temperature"], self.training) * open_
+            pres = sample_presence(prob, schedule["temperature"], noise) * open_
             top = prob.detach().topk(self.render_top, dim=1).indices
             found = self._found(frame, pres, top)
 
@@ -242,9 +252,9 @@ class Apex(SceneModel):
                 )
             )
             state, ids, next_id = candidates.gather(kept.source), kept.ids, kept.next_id
-            carried_on = self._carried_on(b, schedule)
+            carried_on = self._carried_on(carried_on, schedule, noise)
             valid = kept.valid & carried_on
-        return stack_steps(steps)
+        return stack_steps(steps), Memory(state, valid, ids, next_id, carried_on)
 
     def _context(self, cells: Frame, scope: Float[Tensor, "B H W"]) -> tuple[Tensor, Tensor]:
         """p_context of all cells, and the share of their windows that is not explained yet, each (B, D)."""
@@ -257,27 +267,27 @@ class Apex(SceneModel):
         contexts, shares = zip(*found, strict=True)
         return joined(contexts), joined(shares)
 
-    def _carried_on(self, batch: int, schedule: Schedule) -> Tensor:
+    def _carried_on(self, before: Tensor, schedule: Schedule, noise: Noise | None) -> Tensor:
         """Which videos carry their objects into the next frame, (B, 1); all in evaluation.
 
         A curriculum over sequence length without another shape: with probability 1 - carry a video starts afresh, so
         at 0 all frames are images that discovery explains alone, at 1 videos are whole. Propagation learns from
         objects that exist; carried false ones of the first steps only teach it that objects should vanish.
         """
-        if not self.training:
-            return torch.ones(batch, 1, dtype=torch.bool, device=schedule["carry"].device)
-        return torch.rand(batch, 1, device=schedule["carry"].device) < schedule["carry"]
+        if noise is None:
+            return torch.ones_like(before)
+        return noise.uniform(before.float()) < schedule["carry"]
 
-    def _may_discover(self, carried_on: Tensor, schedule: Schedule) -> Tensor:
+    def _may_discover(self, carried_on: Tensor, schedule: Schedule, noise: Noise | None) -> Tensor:
         """Which videos may discover objects in this frame, (B, 1); all in evaluation.
 
         Rediscovering everything in every frame explains a video as well as tracking does, for the price of a few KL
         terms, and in early trials the presence of propagated objects died and did not revive. So in training a video
         that carries objects is now and then left to them alone (a conjecture; not yet ablated by itself).
         """
-        if not self.training:
+        if noise is None:
             return torch.ones_like(carried_on)
-        return ~carried_on | (torch.rand(carried_on.shape, device=carried_on.device) < schedule["discover"])
+        return ~carried_on | (noise.uniform(carried_on.float()) < schedule["discover"])
 
     def _found(self, cells: Frame, pres: Tensor, top: Tensor) -> Objects:
         """The rendered discoveries of a frame as objects; their other recurrent states start at zero."""
@@ -292,7 +302,15 @@ class Apex(SceneModel):
             nothing,
         )
 
-    def _explain(self, video: Tensor, proposals: Proposals, steps: Step, schedule: Schedule) -> Scene:
+    def _explain(
+        self,
+        video: Tensor,
+        proposals: Proposals,
+        steps: Step,
+        context: Context,
+        noise: Noise | None,
+        state_with: Callable[[Tensor], State],
+    ) -> Scene:
         """Rendering, likelihood, KL and the result; no frame waits for another, so a GPU does all at once."""
         b, t = video.shape[:2]
         images = video.flatten(0, 1)
@@ -306,13 +324,14 @@ class Apex(SceneModel):
         ]
 
         q_background = self.background.posterior(joined(m.background for m in masks), images)
-        z_background = q_background.sample(self.training)
+        z_background = q_background.sample(noise)
         backdrop = self.background.decode(z_background)
-        p_background = self.background.prior(z_background.unflatten(0, (b, t)))
+        over_time = z_background.unflatten(0, (b, t))
+        p_background = self.background.prior(over_time, None if context.state is None else context.state.z_background)
         kl_background = kl_gaussian(type(q_background)(*(x.unflatten(0, (b, t)) for x in q_background)), p_background)
 
         pictures = [
-            self._picture(*part, schedule)
+            self._picture(*part, context)
             for part in zip(images.split(size), parts, pasters, masks, backdrop.split(size), strict=True)
         ]
         picture = video_of(pictures, b)
@@ -334,10 +353,10 @@ class Apex(SceneModel):
             "kl_background": kl_background.sum(1),
             "mask_entropy": picture.mask_entropy.sum(1),
         }
-        return scene_of(steps, picture, terms)
+        return scene_of(steps, picture, terms, context.detail, state_with(over_time[:, -1]))
 
     def _picture(
-        self, image: Tensor, part: Drawn, paster: Paster, masks: Masks, backdrop: Tensor, schedule: Schedule
+        self, image: Tensor, part: Drawn, paster: Paster, masks: Masks, backdrop: Tensor, context: Context
     ) -> Picture:
         """Appearance, likelihood and mask entropy of N frames whose masks are known."""
         colours = torch.sigmoid(self.colour_decoder(part.what.flatten(0, 1))).unflatten(0, part.presence.shape)
@@ -348,8 +367,8 @@ class Apex(SceneModel):
             means,
             masks.log_background,
             backdrop,
-            schedule["sigma_fg_scale"],
-            schedule["sigma_bg_scale"],
+            context.schedule["sigma_fg_scale"],
+            context.schedule["sigma_bg_scale"],
         )
         return Picture(
             masks.objects,
@@ -358,5 +377,5 @@ class Apex(SceneModel):
             log_likelihood,
             mask_entropy(masks),
             backdrop,
-            None if self.training else means,
+            means if context.detail else None,
         )

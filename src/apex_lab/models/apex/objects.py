@@ -17,6 +17,7 @@ from apex_lab.models.apex.slots import gather_slots
 from apex_lab.models.apex.windows import Windows, square_of, window_of
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian, gaussian_from, relaxed_bernoulli
+from apex_lab.scene import Noise
 
 NARROW = -3.0
 """Where heads start the softplus of z_where's standard deviation: at 0.05, under two pixels of 64 for a centre."""
@@ -64,9 +65,9 @@ class Beliefs(NamedTuple):
     p_pres: Tensor
 
 
-def sample_presence(prob: Tensor, temperature: Tensor, stochastic: bool) -> Tensor:
-    """Relaxed Bernoulli in training; the hard decision prob > 0.5 in evaluation."""
-    return relaxed_bernoulli(prob, temperature) if stochastic else (prob > 0.5).to(prob.dtype)
+def sample_presence(prob: Tensor, temperature: Tensor, noise: Noise | None) -> Tensor:
+    """Relaxed Bernoulli; without noise (evaluation) the hard decision prob > 0.5."""
+    return (prob > 0.5).to(prob.dtype) if noise is None else relaxed_bernoulli(prob, temperature, noise)
 
 
 def _set_last_bias(network: nn.Sequential, values: Float[Tensor, " n"], shrink: float = 0.1) -> None:
@@ -138,7 +139,7 @@ class Propagation(nn.Module):
         crop_source: Float[Tensor, "B C2 h w"],
         valid: Bool[Tensor, "B P"],
         temperature: Tensor,
-        stochastic: bool,
+        noise: Noise | None,
     ) -> tuple[Objects, Beliefs]:
         """Objects at t - 1 and the sources at t -> objects at t, and what was believed and expected of them."""
         b, p = before.presence.shape
@@ -155,7 +156,7 @@ class Propagation(nn.Module):
         crop_code = glimpses.follow(crop_source, square_of(window))
         hidden_where = each(self.rnn_where, before.hidden_where, crop_code, before.what, window)
         q_where = gaussian_from(self.head_where(hidden_where))
-        place = self.windows.propagated(before.place, q_where.sample(stochastic))
+        place = self.windows.propagated(before.place, q_where.sample(noise))
 
         # Eq. 15, second factor: z_what
         code = glimpses.look(glimpse_source, window_of(place))
@@ -163,12 +164,12 @@ class Propagation(nn.Module):
             code.flatten(0, 1), before.what.flatten(0, 1), before.hidden_what.flatten(0, 1)
         )
         q_what, hidden_what = Gaussian(*(x.unflatten(0, (b, p)) for x in q_flat)), hidden_flat.unflatten(0, (b, p))
-        what = q_what.sample(stochastic)
+        what = q_what.sample(noise)
 
         # Eq. 15, first factor: z_pres
         hidden_pres = each(self.rnn_pres, before.hidden_pres, crop_code, what, presence)
         q_pres = torch.sigmoid(self.head_pres(hidden_pres)).squeeze(-1)
-        z_pres = torch.where(valid, sample_presence(q_pres, temperature, stochastic), torch.zeros_like(q_pres))
+        z_pres = torch.where(valid, sample_presence(q_pres, temperature, noise), torch.zeros_like(q_pres))
 
         beliefs = Beliefs(
             q_where,
@@ -226,7 +227,7 @@ class Discovery(nn.Module):
         glimpse_source: Float[Tensor, "B T C h2 w2"],
         glimpses: Glimpses,
         appearance: Appearance,
-        stochastic: bool,
+        noise: Noise | None,
     ) -> Proposals:
         """Feature maps -> proposals of all cells of all frames."""
         b, t = features.shape[:2]
@@ -235,14 +236,14 @@ class Discovery(nn.Module):
         d = self.grid**2
         # Eq. 16, last factor: z_where
         q_where = gaussian_from(self.head_where(cells).flatten(2).transpose(1, 2))  # (B T, D, 4)
-        place = self.windows.discovered(q_where.sample(stochastic))
+        place = self.windows.discovered(q_where.sample(noise))
         window = window_of(place)
 
         # Eq. 16, second factor: z_what
         code = glimpses.look(glimpse_source.flatten(0, 1), window).flatten(0, 1)
         nothing = code.new_zeros(code.shape[0], appearance.what)
         q_what, hidden = appearance(code, nothing, code.new_zeros(code.shape[0], appearance.rnn.hidden_size))
-        what = q_what.sample(stochastic).unflatten(0, (b * t, d))
+        what = q_what.sample(noise).unflatten(0, (b * t, d))
 
         # p_proposal of Eq. 17, the first factor of Eq. 16 with p_context, which the loop over time adds
         evidence = torch.cat([cells.flatten(2).transpose(1, 2), what, window], dim=-1)

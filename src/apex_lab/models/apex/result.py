@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from apex_lab.models.apex.rollout import Step
+from apex_lab.models.apex.rollout import State, Step
 from apex_lab.models.apex.slots import gather_slots
 from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.splitting import joined
@@ -33,7 +33,7 @@ class Picture(NamedTuple):
 
     objects (N, R, H, W): masks; foreground (N, H, W): m_fg; reconstruction (N, 3, H, W): RGB in [0, 1].
     log_likelihood, mask_entropy (N,): nats.
-    backdrop (N, 3, H, W): the background's picture; means (N, R, 3, H, W): the objects' pictures, None in training.
+    backdrop (N, 3, H, W): the background's picture; means (N, R, 3, H, W): the objects' images or None.
     """
 
     objects: Tensor
@@ -68,7 +68,9 @@ def _shares(objects: Float[Tensor, "B T P H W"], at_most: int = 5) -> list[Tenso
     return list(ranked[:at_most].unbind())
 
 
-def scene_of(steps: Step, picture: Picture, terms: dict[str, Tensor]) -> Scene:
+def scene_of(
+    steps: Step, picture: Picture, terms: dict[str, Tensor], detail: bool = True, state: State | None = None
+) -> Scene:
     """The P objects carried on and the background, last. Pixels of objects that were dropped become background."""
     b, t, slots = steps.source.shape
     flat = steps.source.flatten(0, 1)
@@ -92,7 +94,7 @@ def scene_of(steps: Step, picture: Picture, terms: dict[str, Tensor]) -> Scene:
         appearance=torch.cat([what, torch.zeros_like(what[..., :1, :])], dim=2),
         reconstruction=picture.reconstruction,
         terms=terms,
-        windows=torch.cat([window, torch.full_like(window[..., :1, :], torch.nan)], dim=2),
+        windows=torch.cat([window, torch.full_like(window[..., :1, :], torch.nan)], dim=2) if detail else None,
         means=None if means is None else torch.cat([held(means), picture.backdrop[:, :, None]], dim=2),
         diagnostics={
             **{f"share_{i}": share for i, share in enumerate(_shares(objects))},
@@ -103,4 +105,5 @@ def scene_of(steps: Step, picture: Picture, terms: dict[str, Tensor]) -> Scene:
             "propagated_prob": kept,
             "propagated_share": (carried & (steps.source < slots)).sum() / carried.sum().clamp_min(1),
         },
+        state=state,
     )

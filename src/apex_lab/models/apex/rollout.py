@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from apex_lab.models.apex.objects import Beliefs, Proposals
+from apex_lab.models.apex.objects import Beliefs, Objects, Proposals
+from apex_lab.scene import ABSENT
 
 
 class Frame(NamedTuple):
@@ -35,6 +36,46 @@ def frames_of(look_at: Tensor, follow_in: Tensor, proposals: Proposals, alphas: 
     """
     fields = (look_at, follow_in, proposals.what, proposals.place, proposals.prob, proposals.hidden_what, alphas)
     return [Frame(*values) for values in zip(*(x.unbind(1) for x in fields), strict=True)]
+
+
+FIRST_ID = 1
+
+
+class Memory(NamedTuple):
+    """What the loop hands from frame to frame.
+
+    objects: contents of the P slots. valid (B, P): the slot holds an object that the next frame may propagate.
+    ids (B, P), next_id (B,): as in `slots.Carried`. carried_on (B, 1): the video's objects are propagated.
+    """
+
+    objects: Objects
+    valid: Bool[Tensor, "B P"]
+    ids: Int[Tensor, "B P"]
+    next_id: Int[Tensor, " B"]
+    carried_on: Bool[Tensor, "B 1"]
+
+    @staticmethod
+    def empty(batch: int, slots: int, what: int, hidden: int, like: Tensor) -> Memory:
+        """Before the first frame."""
+        return Memory(
+            Objects.empty(batch, slots, what, hidden, like),
+            torch.zeros(batch, slots, dtype=torch.bool, device=like.device),
+            torch.full((batch, slots), ABSENT, device=like.device),
+            torch.full((batch,), FIRST_ID, device=like.device),
+            torch.zeros(batch, 1, dtype=torch.bool, device=like.device),
+        )
+
+
+class State(NamedTuple):
+    """`Scene.state`: everything that the next frames of the same videos start from.
+
+    encoder: state of the ConvLSTM. frame (B, 3, H, W): the last frame. memory: of the loop. z_background (B, Z).
+    """
+
+    encoder: tuple[Tensor, Tensor]
+    frame: Tensor
+    memory: Memory
+    z_background: Tensor
 
 
 class Step(NamedTuple):

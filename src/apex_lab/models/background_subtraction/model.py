@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from apex_lab.models.regions import scene_of_regions
-from apex_lab.scene import Scene, SceneModel, Schedule
+from apex_lab.scene import Context, Scene, SceneModel
 
 
 class BackgroundSubtraction(SceneModel):
@@ -40,8 +40,6 @@ class BackgroundSubtraction(SceneModel):
     """
 
     needs_training = False
-    term_names: tuple[str, ...] = ()
-    schedule_names: tuple[str, ...] = ()
     median: Tensor
 
     def __init__(
@@ -75,8 +73,8 @@ class BackgroundSubtraction(SceneModel):
         self.median.copy_(median)
 
     @torch.no_grad()
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
-        """RGB video in [0, 1]; `schedule` has no influence. Works on the CPU, wherever the video lies.
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
+        """RGB video in [0, 1]; `context` has no influence. Works on the CPU, wherever the video lies.
 
         Raises:
             ValueError: frames of another size than `image_size`, or no median picture yet.

@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from apex_lab.models.regions import scene_of_regions
-from apex_lab.scene import Scene, SceneModel, Schedule
+from apex_lab.scene import Context, Scene, SceneModel
 
 SAMPLES = 20_000
 """Pixels of a video that the clusters are fitted to; all pixels are then assigned."""
@@ -59,8 +59,6 @@ class ColorClusters(SceneModel):
     """
 
     needs_training = False
-    term_names: tuple[str, ...] = ()
-    schedule_names: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -78,8 +76,8 @@ class ColorClusters(SceneModel):
         self.seed = seed
 
     @torch.no_grad()
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
-        """RGB video in [0, 1]; `schedule` has no influence. Works on the CPU, wherever the video lies."""
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
+        """RGB video in [0, 1]; `context` has no influence. Works on the CPU, wherever the video lies."""
         pixels = np.ascontiguousarray(video.permute(0, 1, 3, 4, 2).cpu().float().numpy())
         labels = torch.from_numpy(np.stack([self._segment(frames) for frames in pixels]))
         return scene_of_regions(video, labels.to(video.device), self.max_objects + 1)

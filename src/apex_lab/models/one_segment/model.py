@@ -10,18 +10,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from apex_lab.models.regions import scene_of_regions
-from apex_lab.scene import Scene, SceneModel, Schedule
+from apex_lab.scene import Context, Scene, SceneModel
 
 
 class OneSegment(SceneModel):
     """Everything is background, painted in the frame's mean colour. K = 1."""
 
     needs_training = False
-    term_names: tuple[str, ...] = ()
-    schedule_names: tuple[str, ...] = ()
 
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
-        """RGB video in [0, 1]; `schedule` has no influence."""
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
+        """RGB video in [0, 1]; `context` has no influence."""
         batch, frames, _, height, width = video.shape
         labels = torch.zeros(batch, frames, height, width, dtype=torch.long, device=video.device)
         return scene_of_regions(video, labels, components=1)

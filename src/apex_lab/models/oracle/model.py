@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from apex_lab.models.regions import hard_scene, one_hot
-from apex_lab.scene import ABSENT, Scene, SceneModel, Schedule
+from apex_lab.scene import ABSENT, Context, Scene, SceneModel
 
 
 class Oracle(SceneModel):
@@ -25,14 +25,12 @@ class Oracle(SceneModel):
 
     needs_training = False
     needs_labels = True
-    term_names: tuple[str, ...] = ()
-    schedule_names: tuple[str, ...] = ()
 
     def __init__(self, max_label: Annotated[int, Field(ge=1, le=255)] = 15) -> None:
         super().__init__()
         self.components = max_label + 1
 
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
         """Refused: there is nothing to be known from the video alone.
 
         Raises:
