@@ -5,16 +5,15 @@ from __future__ import annotations
 import hashlib
 import os
 import time
-from collections.abc import Iterator
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Dataset, Subset
 
-from apex_lab.scene import Scene, SceneModel, Schedule
+from apex_lab.data import Clip, VideoSet, VideoSource
+from apex_lab.scene import Context, Scene, SceneModel, Statistics
 
 Count = Annotated[int, Field(ge=1)]
 
@@ -23,7 +22,7 @@ class Layers(SceneModel):
     """Explains every frame by `components` layers of one colour each, the first being the background."""
 
     term_names = ("error", "spread")
-    schedule_names = ("noise",)
+    schedule_ranges: ClassVar = {"noise": (0.0, 10.0)}
 
     base: Tensor
 
@@ -35,14 +34,14 @@ class Layers(SceneModel):
         self.masks = nn.Sequential(nn.Conv2d(3, width, 3, padding=1), nn.ReLU(), nn.Conv2d(width, components, 1))
         self.register_buffer("base", torch.zeros(3, 1, 1))
 
-    def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
-        self.base.copy_(median.mean(dim=(1, 2), keepdim=True))
+    def initialise(self, statistics: Statistics) -> None:
+        self.base.copy_(statistics.median.mean(dim=(1, 2), keepdim=True))
 
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
         b, t = video.shape[:2]
         logits = self.masks((video - self.base).flatten(0, 1)).unflatten(0, (b, t))
         if self.training:
-            logits = logits + schedule["noise"] * torch.randn_like(logits)
+            logits = logits + context.schedule["noise"] * context.noise.normal(logits)
         masks = logits.softmax(dim=2)
         weights = masks.sum(dim=(-2, -1), keepdim=True).clamp_min(1e-6)
         colours = torch.einsum("btkhw,btchw->btkc", masks / weights, video)
@@ -63,46 +62,61 @@ class Layers(SceneModel):
         )
 
 
-class Squares(Dataset[dict[str, Any]]):
-    """Videos of one coloured square that moves over a grey background."""
+class Squares(VideoSet):
+    """Videos of one coloured square that moves over a grey background.
 
-    def __init__(self, videos: int, frames: int, image_size: int, seed: int) -> None:
-        self.videos, self.frames, self.image_size, self.seed = videos, frames, image_size, seed
+    The environment can slow it down (TINY_PAUSE, seconds per clip) or break it (TINY_BROKEN_AT, a step).
+    """
+
+    def __init__(self, split: str, videos: int, frames: int, image_size: int, seed: int, labelled: bool = True) -> None:
+        self.split, self.videos, self.frames, self.side, self.seed = split, videos, frames, image_size, seed
+        self.labelled = labelled
+        self.read_clips = 0
 
     def __len__(self) -> int:
         return self.videos
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        generator = torch.Generator().manual_seed(self.seed * 1000 + index)
-        side = self.image_size // 4
-        x, y = torch.randint(0, self.image_size - side - self.frames, (2,), generator=generator).tolist()
+    def length(self, video: int) -> int:
+        return self.frames
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        return self.side, self.side
+
+    def name(self, video: int) -> str:
+        return f"{self.split}_{video:05d}"
+
+    def read(self, clip: Clip) -> dict[str, Tensor]:
+        generator = torch.Generator().manual_seed(self.seed * 1000 + clip.video)
+        side = self.side // 4
+        x, y = torch.randint(0, self.side - side - self.frames, (2,), generator=generator).tolist()
         colour = torch.randint(100, 255, (3, 1, 1), generator=generator)
-        video = torch.full((self.frames, 3, self.image_size, self.image_size), 60, dtype=torch.uint8)
-        segmentation = torch.zeros(self.frames, self.image_size, self.image_size, dtype=torch.uint8)
+        video = torch.full((self.frames, 3, self.side, self.side), 60, dtype=torch.uint8)
+        segmentation = torch.zeros(self.frames, self.side, self.side, dtype=torch.uint8)
         for t in range(self.frames):
             video[t, :, y : y + side, x + t : x + t + side] = colour.to(torch.uint8)
             segmentation[t, y : y + side, x + t : x + t + side] = 2
-        return {"video": video, "segmentation": segmentation, "index": index}
+        frames = slice(clip.start, None if clip.frames is None else clip.start + clip.frames)
+        found = {"video": video[frames], "segmentation": segmentation[frames]}
+        return found if self.labelled else {"video": found["video"]}
 
 
-class Steps:
-    """The batches of all steps that are left."""
+class TrainingSquares(Squares):
+    """The training split, whose clips take time or break as the environment says."""
 
-    def __init__(self, module: SquaresModule) -> None:
-        self._module = module
+    def read(self, clip: Clip) -> dict[str, Tensor]:
+        time.sleep(float(os.environ.get("TINY_PAUSE", 0)) / 2)
+        if int(os.environ.get("TINY_BROKEN_AT", -1)) * 2 == self.read_clips - 1:
+            raise RuntimeError(f"the data broke at step {os.environ['TINY_BROKEN_AT']}")
+        self.read_clips += 1
+        return super().read(clip)
 
-    def __iter__(self) -> Iterator[list[int]]:
-        return self._module.order()
-
-    def __len__(self) -> int:
-        return self._module.max_steps - self._module.start_step
+    def median(self, sample: int | None = None) -> Float[Tensor, "3 H W"]:
+        return torch.full((3, self.side, self.side), 60 / 255)
 
 
-class SquaresModule:
-    """Batches of `Squares`; the batches of a step depend on the seed and the step alone.
-
-    The environment can slow it down (TINY_PAUSE, seconds per batch) or break it (TINY_BROKEN_AT, a step).
-    """
+class SquaresSource(VideoSource):
+    """Three splits of `Squares`."""
 
     def __init__(
         self,
@@ -111,40 +125,28 @@ class SquaresModule:
         train: Count = 6,
         val: Count = 2,
         test: Count = 2,
-        batch_size: Count = 2,
-        seed: Annotated[int, Field(ge=0)] = 0,
+        data_seed: Annotated[int, Field(ge=0)] = 0,
+        workers: Annotated[int, Field(ge=0)] = 0,
+        labelled: bool = True,
     ) -> None:
-        sizes = {"train": train, "val": val, "test": test}
-        self.sets = {name: Squares(n, frames, image_size, seed + i) for i, (name, n) in enumerate(sizes.items())}
-        self.batch_size = batch_size
-        self.fingerprint = hashlib.sha256(repr((image_size, frames, sizes, seed)).encode()).hexdigest()
-        self.seed = seed
-        self.start_step = 0
-        self.max_steps = 0
+        self.workers = workers
+        self.settings = {"image_size": image_size, "frames": frames, "train": train, "val": val, "test": test}
+        kinds = {"train": TrainingSquares, "val": Squares, "test": Squares}
+        self.sets = {
+            name: kind(name, self.settings[name], frames, image_size, data_seed + i, labelled)
+            for i, (name, kind) in enumerate(kinds.items())
+        }
+        self.seed = data_seed
 
-    def prepare_data(self) -> None:
+    def prepare(self) -> None:
         """Nothing to fetch."""
 
-    def setup(self, stage: str | None = None) -> None:
+    def open(self) -> None:
         """Nothing to read."""
 
-    def train_median(self) -> Float[Tensor, "3 H W"]:
-        size = self.sets["train"].image_size
-        return torch.full((3, size, size), 60 / 255)
+    @property
+    def fingerprint(self) -> str:
+        return hashlib.sha256(repr((self.settings, self.seed)).encode()).hexdigest()[:32]
 
-    def order(self) -> Iterator[list[int]]:
-        count = len(self.sets["train"])
-        for step in range(self.start_step, self.max_steps):
-            time.sleep(float(os.environ.get("TINY_PAUSE", 0)))
-            if step == int(os.environ.get("TINY_BROKEN_AT", -1)):
-                raise RuntimeError(f"the data broke at step {step}")
-            generator = torch.Generator().manual_seed(self.seed * 1_000_003 + step)
-            yield torch.randint(0, count, (self.batch_size,), generator=generator).tolist()
-
-    def train_dataloader(self) -> DataLoader[dict[str, Any]]:
-        return DataLoader(self.sets["train"], batch_sampler=Steps(self))
-
-    def loader(self, split: str, videos: int | None = None) -> DataLoader[dict[str, Any]]:
-        data = self.sets[split]
-        chosen = range(len(data) if videos is None else min(videos, len(data)))
-        return DataLoader(Subset(data, chosen), batch_size=self.batch_size)
+    def describe(self) -> dict[str, Any]:
+        return {"name": "squares", "fingerprint": self.fingerprint, "settings": {**self.settings, "seed": self.seed}}

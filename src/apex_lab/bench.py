@@ -23,14 +23,15 @@ from apex_lab.base.files import make_folder, write_json
 from apex_lab.base.validation import shown, validate
 from apex_lab.benchmark import rows as report
 from apex_lab.benchmark.child import in_child
-from apex_lab.benchmark.compare import Comparison, compare
-from apex_lab.benchmark.measure import Case, Mode, measure
+from apex_lab.benchmark.compare import Comparison, compare, twins_of
+from apex_lab.benchmark.measure import Case, measure
+from apex_lab.benchmark.work import clip_length
 from apex_lab.config import command_line as cli
 from apex_lab.config.schema import Config, Job, build_model, check_job
 from apex_lab.config.schema import device as device_of
-from apex_lab.models.apex import Apex
 from apex_lab.runs import provenance
 from apex_lab.runs.folder import group_name
+from apex_lab.training.update import Mode
 
 
 class BenchPart(BaseModel):
@@ -68,7 +69,7 @@ class Bench:
 
     def batch(self, device: str, mode: Mode = "eager") -> tuple[int, int]:
         """Videos and frames that are timed on a device."""
-        videos, frames = self.job.config.data["batch_size"], self.job.config.data["frames"]
+        videos, frames = self.job.config.clips.batch_size, clip_length(self.job.config)
         if device != "cpu":
             return videos, frames
         most = self.asked.cpu_frames if mode == "eager" else self.asked.cpu_compiled_frames
@@ -143,12 +144,10 @@ def bench(asked: Bench) -> None:
         result["rows"].append(row)
         console.say(report.line(row))
     if asked.asked.memory and "cpu" in devices and build_model(config).needs_training:
-        whole = Case(
-            config, "cpu", "eager", True, config.data["batch_size"], config.data["frames"], 0, 1, by_part=False
-        )
+        whole = Case(config, "cpu", "eager", True, config.clips.batch_size, clip_length(config), 0, 1, by_part=False)
         result["whole_batch"] = in_child(measure, whole)
         console.say(report.whole_batch(result["whole_batch"]))
-    if asked.asked.compare and isinstance(build_model(config), Apex):
+    if asked.asked.compare and twins_of(config):
         for device in devices:
             settings = Comparison(config, device, *asked.batch(device), asked.asked.warmup, asked.asked.repeats)
             result["comparisons"].append(compare(settings))

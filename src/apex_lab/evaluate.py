@@ -8,7 +8,7 @@ python -m apex_lab.evaluate predictions=other.npz
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ from apex_lab.config import command_line as cli
 from apex_lab.config import schema as config
 from apex_lab.evaluation import OF_SCENES, Export, ScoringPart
 from apex_lab.evaluation.checkpoint import Request, evaluate_checkpoint, find, load
+from apex_lab.evaluation.other_data import OtherData
 from apex_lab.evaluation.others import Predictions, check_output, output_of, score_others
 from apex_lab.metrics import KEYS
 
@@ -46,11 +47,22 @@ class EvaluateConfig(BaseModel):
     partial: bool
     resize: Literal["masks", "truth"] | None
     output: str | None = Field(min_length=1)
+    batch_size: int = Field(default=4, ge=1)
+    chunk: int | None = Field(default=None, ge=1)
+    data: dict[str, Any] = Field(default_factory=dict)
+    seed: int = Field(default=0, ge=0)
     scoring: ScoringPart
     paths: config.PathsPart
 
 
-OF_CHECKPOINTS = {"videos": None, "export": None, "folder": None, "again": False}
+OF_CHECKPOINTS: dict[str, Any] = {
+    "videos": None,
+    "export": None,
+    "folder": None,
+    "again": False,
+    "data": {},
+    "chunk": None,
+}
 OF_PREDICTIONS = {"format": None, "truth": None, "partial": False, "resize": None, "output": None}
 """Keys that mean something for one kind of evaluation alone, and what they say where nobody asks."""
 
@@ -61,6 +73,7 @@ class Evaluation:
 
     asked: EvaluateConfig
     files: tuple[Path, ...] = ()
+    data: OtherData = field(default_factory=OtherData)
     predictions: Predictions | None = None
 
 
@@ -103,14 +116,16 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
     files = find([asked.checkpoint] if isinstance(asked.checkpoint, str) else asked.checkpoint or [])
     if not files:
         raise UserError("checkpoint = [] names no file: give a .ckpt file or a run folder.")
-    jobs = {file: load(file, asked.paths)[1] for file in files}
+    given = [word.lstrip("+").partition("=")[0] for word in overrides if word.lstrip("+").startswith("data.")]
+    data = OtherData(asked.data, tuple(key.removeprefix("data.") for key in given))
+    jobs = {file: load(file, asked.paths, data)[1] for file in files}
     if asked.scoring.masks == "posterior":
         without = [str(file) for file, job in jobs.items() if not config.build_model(job.config).has_posterior]
         if without:
             raise UserError(
                 f"scoring.masks = posterior goes with mixture likelihoods alone: leave out {', '.join(without)}."
             )
-    return Evaluation(asked, files=tuple(files))
+    return Evaluation(asked, files=tuple(files), data=data)
 
 
 def evaluate(job: Evaluation) -> None:
@@ -122,7 +137,7 @@ def evaluate(job: Evaluation) -> None:
     if job.predictions is not None:
         score_others(job.predictions)
         return
-    request = _request(job.asked)
+    request = _request(job.asked, job.data)
     if len(job.files) == 1:
         evaluate_checkpoint(request, job.files[0], alone=True)
         return
@@ -146,7 +161,7 @@ def _refuse(asked: EvaluateConfig, others: Mapping[str, Any], kind: str) -> None
             raise UserError(f"{key} = {shown(value)} goes with {kind}=... alone: leave it out.")
 
 
-def _request(asked: EvaluateConfig) -> Request:
+def _request(asked: EvaluateConfig, data: OtherData) -> Request:
     return Request(
         split=asked.split,
         videos=asked.videos,
@@ -159,6 +174,9 @@ def _request(asked: EvaluateConfig) -> Request:
         accelerator=asked.accelerator,
         folder=None if asked.folder is None else Path(asked.folder),
         paths=asked.paths,
+        data=data,
+        batch_size=asked.batch_size,
+        chunk=asked.chunk,
     )
 
 

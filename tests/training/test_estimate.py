@@ -5,9 +5,9 @@ import time
 import pytest
 import torch
 
+from apex_lab.base import progress
 from apex_lab.config.schema import build_model
 from apex_lab.scene import Scene, Schedule
-from apex_lab.base import progress
 from apex_lab.training import estimate
 from tests.conftest import compose_job
 from tests.tiny import Layers

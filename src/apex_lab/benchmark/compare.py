@@ -1,12 +1,14 @@
-"""APEX against its straightforward variant: who trains more frames per second, measured in turns."""
+"""A model against its naive twins: which trains more frames per second, measured in turns."""
 
 from __future__ import annotations
 
 import contextlib
-import copy
+import importlib
+import importlib.util
 import multiprocessing
 import signal
 import statistics
+import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,15 +20,12 @@ import torch
 from apex_lab.base.errors import UserError
 from apex_lab.benchmark.child import death
 from apex_lab.benchmark.measure import once, spread
-from apex_lab.benchmark.straightforward import Straightforward
 from apex_lab.benchmark.work import Workload
-from apex_lab.config.schema import Config, components
-from apex_lab.models.apex import Apex
+from apex_lab.config.schema import Config, build_model, conf_dir
+from apex_lab.scene import SceneModel
 
-APEX = "apex"
-STRAIGHTFORWARD = "straightforward"
-RENDERS_AS_MANY = "straightforward, renders as many"
-NAMES = (APEX, STRAIGHTFORWARD, RENDERS_AS_MANY)
+MODEL = "model"
+"""Name of the model itself among the compared ones."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class Comparison:
     """What to compare on.
 
     Attributes:
-        config: of the run; its model is an `Apex`.
+        config: of the run; its model has naive twins.
         device: "cpu" or "cuda".
         batch_size, frames: of the batch, the same for all.
         warmup, repeats: rounds before and during the measurement; in each, every model makes one step.
@@ -48,31 +47,35 @@ class Comparison:
     repeats: int
 
 
-def straightforward(config: Config, model: Apex, render_top: int | None) -> Straightforward:
-    """The variant of a model that the configuration builds, as wide and with the same weights.
+def twins_of(config: Config) -> dict[str, SceneModel] | None:
+    """Naive twins of the model of a configuration, with its weights, by name; None where there are none.
 
-    Args:
-        config: what `model` was built from.
-        model: whose weights are taken.
-        render_top: how many cells of discovery are rendered; None renders all.
+    They lie in the repository's tests/reference/<model>.py, which has a function `twins(model, node)`; the installed
+    package is without them.
     """
-    node = copy.deepcopy(config.model)
-    node.update(_target_=f"{Straightforward.__module__}.{Straightforward.__name__}", render_top=render_top)
-    variant = components.build(node, "model")
-    assert isinstance(variant, Straightforward)
-    variant.load_state_dict(model.state_dict())
-    return variant
+    model = build_model(config)
+    package = type(model).__module__.removeprefix("apex_lab.models.").split(".")[0]
+    name = f"tests.reference.{package}"
+    root = str(conf_dir().parent)
+    if root not in sys.path:
+        sys.path.append(root)
+    try:
+        if importlib.util.find_spec(name) is None:
+            return None
+    except ModuleNotFoundError:
+        return None
+    return importlib.import_module(name).twins(model, config.model)
 
 
 def workload(asked: Comparison, name: str) -> Workload:
-    """One of the three models of a comparison, with its batch and its optimiser."""
+    """One of the models of a comparison, with its batch and its optimiser."""
     device = torch.device(asked.device)
-    work = Workload(asked.config, device, asked.batch_size, asked.frames)
-    assert isinstance(work.model, Apex)
-    if name == APEX:
-        return work
-    variant = straightforward(asked.config, work.model, None if name == STRAIGHTFORWARD else work.model.render_top)
-    return Workload(asked.config, device, asked.batch_size, asked.frames, variant)
+    model = None
+    if name != MODEL:
+        twins = twins_of(asked.config)
+        assert twins is not None
+        model = twins[name]
+    return Workload(asked.config, device, asked.batch_size, asked.frames, model)
 
 
 def timed_step(work: Workload) -> Callable[[], tuple[float, float]]:
@@ -134,7 +137,7 @@ def own_process(asked: Comparison, name: str) -> Iterator[Callable[[], tuple[flo
 
 
 def compare(asked: Comparison) -> dict[str, Any]:
-    """Frames per second of APEX and of both variants, and the ratios, round by round.
+    """Frames per second of the model and of its naive twins, and the ratios, round by round.
 
     Each model has a process of its own, as in a training, so that none works in memory that another has left behind;
     they make their steps in turns, so that whatever else the machine does meets them alike. On the CPU the ratios are
@@ -143,17 +146,18 @@ def compare(asked: Comparison) -> dict[str, Any]:
     Raises:
         UserError: memory ran out.
     """
-    seconds: dict[str, list[float]] = {name: [] for name in NAMES}
-    processor: dict[str, list[float]] = {name: [] for name in NAMES}
+    names = [MODEL, *(twins_of(asked.config) or {})]
+    seconds: dict[str, list[float]] = {name: [] for name in names}
+    processor: dict[str, list[float]] = {name: [] for name in names}
     with contextlib.ExitStack() as stack:
-        steps = {name: stack.enter_context(own_process(asked, name)) for name in NAMES}
+        steps = {name: stack.enter_context(own_process(asked, name)) for name in names}
         for i in range(asked.warmup + asked.repeats):
             for name, step in steps.items():
                 passed, worked = step()
                 if i >= asked.warmup:
                     seconds[name].append(passed)
                     processor[name].append(worked)
-    ratios, in_processor_time = ({n: _ratios(times[APEX], times[n]) for n in NAMES} for times in (seconds, processor))
+    ratios, in_processor_time = ({n: _ratios(times[MODEL], times[n]) for n in names} for times in (seconds, processor))
     frames = asked.batch_size * asked.frames
     return {
         "device": asked.device,
@@ -163,14 +167,14 @@ def compare(asked: Comparison) -> dict[str, Any]:
         "models": {
             name: {
                 **spread(seconds[name], frames),
-                "apex_trains_times_as_many": statistics.median(ratios[name]),
+                "model_trains_times_as_many": statistics.median(ratios[name]),
                 "times_min_max": [min(ratios[name]), max(ratios[name])],
                 "times_in_processor_time": statistics.median(in_processor_time[name])
                 if asked.device == "cpu"
                 else None,
                 "processor_seconds": statistics.median(processor[name]),
             }
-            for name in NAMES
+            for name in names
         },
     }
 

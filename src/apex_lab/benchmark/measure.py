@@ -8,18 +8,18 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch._dynamo.exc import TorchDynamoException
 from torch._dynamo.utils import counters
 
 from apex_lab.base.validation import one_line
-from apex_lab.benchmark.profile import PARTS
+from apex_lab.benchmark.profile import seconds_by_part
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.schema import Config
+from apex_lab.training.update import Mode
 
-Mode = Literal["eager", "compiled", "cuda graph"]
 GIB = 2**30
 
 
@@ -30,7 +30,7 @@ class Case:
     Attributes:
         config: of the run; its precision is that of the row.
         device: "cpu" or "cuda".
-        mode: `compiled` is `model.compile()`, `cuda graph` the same with mode="reduce-overhead".
+        mode: `compiled` is `model.compile()`; `cuda graph` captures the whole step besides.
         training: a training step, or an inference.
         batch_size, frames: of the batch.
         warmup, repeats: steps before and during the measurement.
@@ -52,9 +52,7 @@ def measure(case: Case) -> dict[str, Any]:
     """What one row says; see the keys. `unavailable` holds a sentence where the case cannot be run here."""
     device = torch.device(case.device)
     before = peak_memory(device)
-    work = Workload(case.config, device, case.batch_size, case.frames)
-    if case.mode != "eager":
-        work.model.compile(mode="reduce-overhead" if case.mode == "cuda graph" else None)
+    work = Workload(case.config, device, case.batch_size, case.frames, mode=case.mode)
     row: dict[str, Any] = {
         "device": case.device,
         "mode": case.mode,
@@ -115,13 +113,10 @@ def spread(seconds: list[float], frames: int) -> dict[str, Any]:
 
 
 def parts(work: Workload, case: Case) -> dict[str, float]:
-    """Median seconds of each part over as many further steps; empty parts are left out."""
-    runs = [work.seconds_by_part(case.training) for _ in range(case.repeats)]
-    return {
-        name: statistics.median(run.get(name, 0.0) for run in runs)
-        for name in PARTS
-        if any(name in run for run in runs)
-    }
+    """Median seconds of each part over as many further steps, under the profiler; empty parts are left out."""
+    runs = [seconds_by_part(work.step(case.training), work.device) for _ in range(case.repeats)]
+    names = dict.fromkeys(name for run in runs for name in run)
+    return {name: statistics.median(run.get(name, 0.0) for run in runs) for name in names}
 
 
 def kernels(step: Callable[[], object]) -> dict[str, int]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from apex_lab.benchmark.profile import PARTS
-
 Row = Mapping[str, Any]
 
 
@@ -45,16 +43,16 @@ def whole_batch(row: Row) -> str:
 
 
 def comparison(compared: Row) -> str:
-    """APEX against each variant, a sentence each."""
+    """The model against each naive twin, a sentence each."""
     said = []
     for variant, found in compared["models"].items():
-        if variant == "apex":
+        if variant == "model":
             continue
         low, high = found["times_min_max"]
-        both = [_speed(compared["models"][model]["frames_per_second"]) for model in ("apex", variant)]
+        both = [_speed(compared["models"][model]["frames_per_second"]) for model in ("model", variant)]
         said.append(
-            f"{compared['device']}: APEX trains {found['apex_trains_times_as_many']:.2f} times as many frames/s as "
-            f'the variant "{variant}" ({low:.2f} to {high:.2f}; {" and ".join(both)}; '
+            f"{compared['device']}: the model trains {found['model_trains_times_as_many']:.2f} times as many frames/s as "
+            f'the naive twin "{variant}" ({low:.2f} to {high:.2f}; {" and ".join(both)}; '
             f"batch {compared['batch_size']} x {compared['frames']} frames"
             + ("" if (of := found["times_in_processor_time"]) is None else f"; {of:.2f} in processor time")
             + ")"
@@ -73,7 +71,7 @@ def tables(rows: Sequence[Row]) -> list[str]:
     made = [_table([header, *lines])] if lines else []
     by_part = [row for row in measured if "parts" in row]
     if by_part:
-        names = [part for part in PARTS if any(part in row["parts"] for row in by_part)]
+        names = list(dict.fromkeys(part for row in by_part for part in row["parts"]))
         lines = [
             [part, *(f"{row['parts'][part]:.3f}" if part in row["parts"] else "" for row in by_part)] for part in names
         ]

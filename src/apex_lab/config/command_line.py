@@ -74,7 +74,10 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
             traceback.print_exc()
             failures.append((name, f"{type(error).__name__}: {one_line(error)}"))
 
-    sys.argv[1:] = _options_last(sys.argv[1:])
+    sys.argv[1:] = _full_names(_options_last(sys.argv[1:]))
+    if config_name == "evaluate":
+        # the checkpoint brings the data's settings, so no file here has them; the check knows which exist
+        sys.argv[1:] = [f"++{word}" if word.startswith("data.") else word for word in sys.argv[1:]]
     try:
         with interruptible():
             _preflight(config_name, check)
@@ -177,7 +180,7 @@ def _check_groups(command: str, overrides: Sequence[str]) -> None:
         if key not in CHOICES or override.is_delete() or override.is_sweep_override():
             continue
         word = override.get_value_element_as_str()
-        if command == "evaluate":
+        if command == "evaluate" and key != "data":
             raise UserError(f"{key}={word} is for training: a checkpoint brings its own configuration; leave it out.")
         plus = "+" if override.is_add() else ""
         if isinstance(override.value(), list):
@@ -200,8 +203,26 @@ def _expand(overrides: Sequence[str]) -> list[list[str]]:
 
 
 def _choices(choices: Any) -> dict[str, str]:
-    """The words chosen on the command line or by default, Hydra's own groups left out."""
-    return {str(k): str(v) for k, v in choices.items() if not str(k).startswith("hydra/") and v is not None}
+    """The words chosen on the command line or by default; Hydra's own groups, and a recipe without a file, left out."""
+    found = {str(k): str(v) for k, v in choices.items() if not str(k).startswith("hydra/") and v is not None}
+    model, _, scale = found.get("recipe", "").rpartition("/")
+    if scale not in GlobalHydra.instance().config_loader().get_group_options(f"recipe/{model}"):
+        found.pop("recipe", None)
+    return found
+
+
+SHORT = {name: f"model/apex/{name}" for name in ("likelihood", "masks", "glimpses")}
+"""Short word -> group: APEX's swappable parts may be chosen by the last part of their names."""
+
+
+def _full_names(arguments: Sequence[str]) -> list[str]:
+    """The same words with the full names of groups."""
+
+    def full(word: str) -> str:
+        key, equals, value = word.partition("=")
+        return f"{SHORT[key]}={value}" if equals and key in SHORT else word
+
+    return [full(word) for word in arguments]
 
 
 def _options_last(arguments: Sequence[str]) -> list[str]:
@@ -236,8 +257,10 @@ def _told(error: Exception, overrides: Sequence[str]) -> str:
     unlisted = re.match(r"(?:In '([^']+)': )?Could not override '([^']+)'\.\s+No match in the defaults list", text)
     if unlisted:
         inside, group = unlisted.groups()
-        if inside:
-            return f"{inside.replace('/', '=')} swaps APEX's {group}, and no APEX is chosen here: add model=apex."
+        if inside or group in SHORT.values():
+            chosen = inside.replace("/", "=") if inside else given.get(group, group)
+            part = group.rpartition("/")[2]
+            return f"{chosen} swaps APEX's {part}, and no APEX is chosen here: add model=apex."
         return f"{given.get(group, group)} has no default to replace: write +{given.get(group, group)}."
     there = re.match(r"Could not append to config\. An item is already at '([^']+)'", text)
     if there:

@@ -7,6 +7,7 @@ parameter's type, strictly (no "3" for 3, no 1 for true; a whole number is taken
 
 from __future__ import annotations
 
+import functools
 import inspect
 import pkgutil
 import types
@@ -29,6 +30,11 @@ _STRICT = ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True, 
 def is_node(value: object) -> bool:
     """Whether a value of a plain configuration describes a component."""
     return isinstance(value, Mapping) and "_target_" in value
+
+
+def arguments_of(node: Node) -> dict[str, Any]:
+    """What a node gives to the constructor."""
+    return {str(name): value for name, value in node.items() if name not in ("_target_", "_partial_")}
 
 
 def target_of(node: Node, key: str) -> Callable[..., Any]:
@@ -62,11 +68,19 @@ def check(node: Node, key: str, supplied: Iterable[str] = ()) -> None:
         key: where the node stands in the configuration, for messages.
         supplied: parameters that code gives at construction, not the configuration.
 
+    A node with `_partial_: true` makes a function that builds the component when it gets what is missing; so parameters
+    may be missing.
+
     Raises:
         UserError: unknown key, missing key, wrong type or value out of bounds; one sentence.
     """
     parameters, open_ended = _parameters(target_of(node, key), key, set(supplied))
-    values = {name: value for name, value in node.items() if name != "_target_"}
+    values = arguments_of(node)
+    if node.get("_partial_"):
+        parameters = {
+            name: (hint, None if default is ... and name not in values else default)
+            for name, (hint, default) in parameters.items()
+        }
     for name, value in values.items():
         if name not in parameters and (name in supplied or not open_ended):
             raise UserError(sentence(f"Unknown key {key}.{name} = {shown(value)}{did_you_mean(name, parameters)}"))
@@ -92,7 +106,9 @@ def build(node: Node, key: str, **supplied: Any) -> Any:
     Raises:
         UserError: a constructor raised ValueError, TypeError or UserError.
     """
-    arguments = {name: _build_inside(value, f"{key}.{name}") for name, value in node.items() if name != "_target_"}
+    arguments = {name: _build_inside(value, f"{key}.{name}") for name, value in arguments_of(node).items()}
+    if node.get("_partial_"):
+        return functools.partial(target_of(node, key), **arguments)
     try:
         return target_of(node, key)(**arguments, **supplied)
     except UserError as error:
@@ -151,7 +167,7 @@ def _hints(target: Callable[..., Any]) -> dict[str, Any]:
 
 def _check_built(value: Any, hint: Any, key: str) -> None:
     """Whether what a nested component builds is what its place asks for, as far as both are classes."""
-    if not is_node(value):
+    if not is_node(value) or value.get("_partial_"):
         return
     built = target_of(value, key)
     wanted = _classes(hint)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,9 +17,12 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
 from apex_lab.config import components
 from apex_lab.config.components import is_node
-from apex_lab.metrics.modules import PAPER_SCORES
+from apex_lab.data.source import VideoSource
 from apex_lab.scene import SceneModel
 from apex_lab.training.schedules import Constant
+
+VALIDATION_SCORES = ("ari_fg", "msc_fg", "ari", "msc", "mota", "match")
+"""Scores that validation puts into the curves; those of tracking only for models that track."""
 
 
 def conf_dir() -> Path:
@@ -40,11 +43,17 @@ class _Part(BaseModel):
 
 
 class TrainerPart(_Part):
-    """How long and on what a model is trained; `steps` are weight updates."""
+    """How long and on what a model is trained; `steps` are weight updates.
+
+    A key that was added later has the default that stands in `apex_lab.config.upgrades.ADDED` too.
+    """
 
     accelerator: Literal["auto", "cpu", "gpu"]
+    devices: int = Field(default=1, ge=1)
+    num_nodes: int = Field(default=1, ge=1)
     precision: Literal[32, "bf16-mixed"]
     compile: bool
+    cuda_graph: bool = False
     max_steps: int = Field(ge=1)
     gradient_clip_norm: float | None = Field(gt=0)
     log_interval: int = Field(ge=1)
@@ -55,12 +64,26 @@ class TrainerPart(_Part):
     monitor_mode: Literal["max", "min"]
 
 
+class ClipsPart(_Part):
+    """What a training step sees.
+
+    Attributes:
+        batch_size: clips of the global batch.
+        frames: of a clip: null for whole videos, a number, or a schedule.
+    """
+
+    batch_size: int = Field(ge=1)
+    frames: int | dict[str, Any] | None = None
+
+
 class EvaluationPart(_Part):
     """What is measured and drawn at the end of training; `videos` null means the whole split."""
 
     split: Literal["train", "val", "test"]
     videos: int | None = Field(ge=1)
     pictures: int = Field(ge=0)
+    batch_size: int = Field(default=4, ge=1)
+    chunk: int | None = Field(default=None, ge=1)
 
 
 class PathsPart(_Part):
@@ -80,6 +103,7 @@ class Config(_Part):
     loss: dict[str, float | dict[str, Any]]
     lr_scale: float | dict[str, Any]
     data: dict[str, Any]
+    clips: ClipsPart
     trainer: TrainerPart
     logger: dict[str, dict[str, Any]]
     callbacks: dict[str, dict[str, Any]]
@@ -144,11 +168,19 @@ def refuse_missing(raw: Mapping[str, Any], prefix: str = "") -> None:
             refuse_missing(value, f"{prefix}{key}.")
 
 
-def check_job(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str] = ()) -> Job:
+def check_job(
+    raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str] = (), needs_recipe: bool = True
+) -> Job:
     """Checks everything that can be known before work starts; the first fault is told in one sentence.
 
     Types and bounds of every key, components against their constructors' signatures, and whether model, schedules and
     loss belong together. Components are built once (none reads data or starts anything when built).
+
+    Args:
+        raw: plain containers, all interpolations resolved.
+        choices: group -> word.
+        overrides: the words on the command line.
+        needs_recipe: refuse a model that learns without a recipe among the choices.
 
     Raises:
         UserError: the sentence.
@@ -158,6 +190,8 @@ def check_job(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequen
     config = validate(Config, raw, "", also_known=groups)
     assert isinstance(config, Config)
     refuse_missing(raw)
+    if needs_recipe:
+        _check_recipe(config, choices)
     _check_components(config)
     _check_objective(config)
     _check_splits(config)
@@ -192,8 +226,8 @@ def build_model(config: Config) -> SceneModel:
     return model
 
 
-def build_optimizer(config: Config, parameters: Sequence[torch.nn.Parameter]) -> torch.optim.Optimizer:
-    """The optimiser over the given parameters.
+def build_optimizer(config: Config, parameters: Sequence[tuple[str, torch.nn.Parameter]]) -> torch.optim.Optimizer:
+    """The optimiser over the given parameters, which it gets with their names.
 
     Raises:
         UserError: none is configured, or its constructor refuses its values.
@@ -220,9 +254,28 @@ def build_lr_scale(config: Config) -> Callable[[int], float]:
     return _build_value(config.lr_scale, "lr_scale")
 
 
+def build_clip_frames(config: Config) -> Callable[[int], int | None]:
+    """Frames of a training clip as a function of the step; None: whole videos."""
+    frames = config.clips.frames
+    if isinstance(frames, dict):
+        schedule = components.build(frames, "clips.frames")
+        return lambda step: int(schedule(step))
+    return lambda step: frames
+
+
 def _build_value(value: float | dict[str, Any], key: str) -> Callable[[int], float]:
     """A schedule; a number is one that never changes."""
     return components.build(value, key) if isinstance(value, dict) else Constant(value)
+
+
+def _check_recipe(config: Config, choices: Mapping[str, str]) -> None:
+    """A model that learns needs a recipe for its scale; nothing is filled in by default."""
+    target = components.target_of(config.model, "model")
+    if "recipe" not in choices and getattr(target, "needs_training", False):
+        model, scale = choices.get("model", "<model>"), choices.get("scale", "<scale>")
+        there = sorted(path.stem for path in (conf_dir() / "recipe" / model).glob("*.yaml"))
+        known = f": choose scale={' or '.join(there)}" if there else ""
+        raise UserError(f"model={model} has no recipe conf/recipe/{model}/{scale}.yaml{known}.")
 
 
 def _check_components(config: Config) -> None:
@@ -235,10 +288,8 @@ def _check_components(config: Config) -> None:
             raise UserError(f"optimizer.lr = {rate} is wrong: a learning rate is above 0.")
     for name, node in config.schedule.items():
         components.check(node, f"schedule.{name}")
-    for key, value in {
-        **{f"loss.{name}": value for name, value in config.loss.items()},
-        "lr_scale": config.lr_scale,
-    }.items():
+    numbers: dict[str, Any] = {f"loss.{name}": value for name, value in config.loss.items()}
+    for key, value in {**numbers, "lr_scale": config.lr_scale, "clips.frames": config.clips.frames}.items():
         if isinstance(value, dict):
             if not is_node(value):
                 raise UserError(f"{key} = {shown(value)} is wrong: give a number or a schedule with a _target_.")
@@ -253,10 +304,11 @@ def _check_objective(config: Config) -> None:
     """Builds model, optimiser and schedules, and compares their names."""
     model = build_model(config)
     schedules, weights = build_schedules(config), build_weights(config)
-    components.build(config.data, "data")
+    source = components.build(config.data, "data")
+    if not isinstance(source, VideoSource):
+        raise UserError(f"data._target_ = {config.data['_target_']!r} is not an apex_lab.data.VideoSource.")
     for name, node in config.callbacks.items():
         components.build(node, f"callbacks.{name}")
-    _check_image_size(config)
     values = {f"schedule.{name}": value for name, value in schedules.items()}
     values |= {f"loss.{name}": value for name, value in weights.items()}
     values["lr_scale"] = build_lr_scale(config)
@@ -266,21 +318,35 @@ def _check_objective(config: Config) -> None:
     ranges = dict.fromkeys(values, (0.0, math.inf)) | dict.fromkeys(
         (f"schedule.{name}" for name in schedules), (-math.inf, math.inf)
     )
-    ranges |= {f"schedule.{name}": limits for name, limits in getattr(model, "schedule_ranges", {}).items()}
+    ranges |= {f"schedule.{name}": limits for name, limits in model.schedule_ranges.items()}
     for key, value in values.items():
         _check_range(key, value, ranges[key], config.trainer.max_steps)
-    _same_names("schedule", schedules, getattr(model, "schedule_names", ()))
-    _same_names("loss", weights, getattr(model, "term_names", ()))
+    _same_names("schedule", schedules, model.schedule_ranges)
+    _same_names("loss", weights, model.term_names)
     if model.needs_training:
-        build_optimizer(config, [torch.nn.Parameter(torch.zeros(1))])
+        build_optimizer(config, [(name, p) for name, p in model.named_parameters() if p.requires_grad])
         _check_monitor(config.trainer, model)
+        _check_clips(config)
 
 
-def _check_image_size(config: Config) -> None:
-    """Models that are built for one image size must get the data's."""
-    built, made = config.model.get("image_size"), config.data.get("image_size")
-    if built is not None and made is not None and built != made:
-        raise UserError(f"model.image_size = {built}, but data.image_size = {made}: set data.image_size alone.")
+def _check_clips(config: Config) -> None:
+    """Batches that can be shared among the ranks, clips of at least a frame."""
+    ranks = config.trainer.devices * config.trainer.num_nodes
+    if config.clips.batch_size % ranks:
+        raise UserError(
+            f"clips.batch_size = {config.clips.batch_size} is the global batch, which {ranks} processes "
+            "(trainer.devices x trainer.num_nodes) cannot share equally: choose a multiple."
+        )
+    frames, longest = build_clip_frames(config), config.data.get("frames")
+    last = config.trainer.max_steps
+    for step in [*range(0, last, max(1, last // 1000)), last]:
+        wanted = frames(step)
+        if wanted is None:
+            continue
+        if wanted < 1:
+            raise UserError(f"clips.frames is {wanted} at step {step}: a clip has at least one frame.")
+        if isinstance(longest, int) and wanted > longest:
+            raise UserError(f"clips.frames is {wanted} at step {step}, but videos have data.frames = {longest} frames.")
 
 
 def _check_range(key: str, schedule: Callable[[int], float], limits: tuple[float, float], last: int) -> None:
@@ -300,8 +366,7 @@ def _check_range(key: str, schedule: Callable[[int], float], limits: tuple[float
 
 def _check_monitor(trainer: TrainerPart, model: SceneModel) -> None:
     """The score that decides on best.ckpt must be one that validation gives."""
-    terms = getattr(model, "term_names", ())
-    known = [f"val/{name}" for name in (*PAPER_SCORES, "foreground_share", "loss", *terms)]
+    known = [f"val/{name}" for name in (*VALIDATION_SCORES, "foreground_share", "loss", *model.term_names)]
     if trainer.monitor not in known:
         guess = did_you_mean(trainer.monitor, known)
         raise UserError(sentence(f"trainer.monitor = '{trainer.monitor}' is none of {', '.join(known)}{guess}"))
@@ -320,7 +385,7 @@ def _check_splits(config: Config) -> None:
         )
 
 
-def _same_names(key: str, given: Mapping[str, object], wanted: Sequence[str]) -> None:
+def _same_names(key: str, given: Mapping[str, object], wanted: Collection[str]) -> None:
     for name in given:
         if name not in wanted:
             raise UserError(
@@ -331,5 +396,5 @@ def _same_names(key: str, given: Mapping[str, object], wanted: Sequence[str]) ->
             raise UserError(f"{key}.{name} is missing: the model needs {_listed(wanted)}.")
 
 
-def _listed(names: Sequence[str]) -> str:
+def _listed(names: Collection[str]) -> str:
     return ", ".join(names) if names else "none"

@@ -1,21 +1,22 @@
-"""Data sets and their batches: P2D as a plain torch data set and as a Lightning data module."""
+"""Data sets of videos: `P2D` as a plain PyTorch data set, and what a run needs of any data set."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
+from apex_lab.data.clips import ClipSampler
+from apex_lab.data.loading import training_loader, whole_loader
 from apex_lab.data.p2d import P2D
+from apex_lab.data.p2d_source import P2DSource
+from apex_lab.data.source import VideoSource
+from apex_lab.data.video_set import Clip, Item, VideoSet
 
-if TYPE_CHECKING:
-    from apex_lab.data.module import P2DModule
-
-__all__ = ["P2D", "P2DModule"]
-
-
-def __getattr__(name: str) -> Any:
-    # Lightning takes seconds to import, and people who bring their own training loop do not need it.
-    if name == "P2DModule":
-        from apex_lab.data.module import P2DModule
-
-        return P2DModule
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__all__ = [
+    "P2D",
+    "Clip",
+    "ClipSampler",
+    "Item",
+    "P2DSource",
+    "VideoSet",
+    "VideoSource",
+    "training_loader",
+    "whole_loader",
+]

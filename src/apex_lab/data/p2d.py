@@ -20,21 +20,25 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.utils.data import Dataset
 
 from apex_lab.base.errors import UserError
+from apex_lab.data.video_set import MEDIAN_SAMPLE, Clip, VideoSet
+from apex_lab.metrics.objects import ObjectMetadata, p2d_metadata
 from sims.errors import SimError
 from sims.p2d.store import FIELDS, SPLITS, array_path
 from sims.p2d.verify import check
 
-MEDIAN_SAMPLE = 1000
+
+def p2d_video_name(split: str, index: int) -> str:
+    """What a P2D video is called in files of predictions and results."""
+    return f"{split}_{index:05d}"
 
 
-class P2D(Dataset[dict[str, Any]]):
+class P2D(VideoSet):
     """One split of a finished P2D folder, read through memory maps.
 
     Items are dicts: `video` uint8 (T, 3, H, W), `segmentation` uint8 (T, H, W) with 0 background, 1 arm, 2 and up
-    objects, each the same number through the whole video, and `index`. Everything else that is known about a
+    objects, each the same number through the whole video, `index` and `name`. Everything else that is known about a
     trajectory comes from `meta`.
 
     Args:
@@ -65,15 +69,36 @@ class P2D(Dataset[dict[str, Any]]):
     def __len__(self) -> int:
         return int(getattr(self.manifest.settings, self.split))
 
-    def __getitem__(self, index: int) -> dict[str, Any]:
-        position = self._position(index)
-        video = self._array("rgb")[position, self.clip].transpose(0, 3, 1, 2)
-        segmentation = self._array("segmentation")[position, self.clip]
+    def length(self, video: int) -> int:
+        """Frames of a video; all have the same number."""
+        return self.clip.stop - self.clip.start
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(H, W) in pixels."""
+        side = self.manifest.settings.image_size
+        return side, side
+
+    def name(self, video: int) -> str:
+        """As exports name it."""
+        return p2d_video_name(self.split, video)
+
+    def read(self, clip: Clip) -> dict[str, Tensor]:
+        """Frames and labels of a clip."""
+        start = self.clip.start + clip.start
+        stop = self.clip.stop if clip.frames is None else start + clip.frames
+        if not self.clip.start <= start < stop <= self.clip.stop:
+            raise IndexError(f"frames {clip.start} to {stop - self.clip.start - 1} of {self.length(clip.video)}")
+        video = self._array("rgb")[clip.video, start:stop].transpose(0, 3, 1, 2)
+        segmentation = self._array("segmentation")[clip.video, start:stop]
         return {
             "video": torch.from_numpy(np.array(video, order="C")),
             "segmentation": torch.from_numpy(np.array(segmentation)),
-            "index": position,
         }
+
+    def metadata(self, video: int) -> ObjectMetadata:
+        """Class, occlusion and contact of every object."""
+        return p2d_metadata(self.meta(video))
 
     def meta(self, index: int) -> dict[str, Any]:
         """All labels of a trajectory besides the segmentation.
@@ -97,19 +122,19 @@ class P2D(Dataset[dict[str, Any]]):
         return dict(self.manifest.facts["camera"])
 
     def median(self, sample: int | None = MEDIAN_SAMPLE) -> Float[Tensor, "3 H W"]:
-        """Per-pixel median picture in [0, 1]: what is there when nothing stands in front of it.
+        """Per-pixel median image in [0, 1]: what is there when nothing stands in front of it.
 
         Args:
             sample: number of frames, evenly spaced over the split; None: all of them, which takes long.
         """
-        frames = self._array("rgb").reshape(-1, *self._array("rgb").shape[2:])
-        if len(frames) == 0:
-            raise UserError(f"split {self.split} of {self.root} is empty, so it has no median picture")
-        count = len(frames) if sample is None else min(sample, len(frames))
+        total = len(self) * self.length(0)
+        if total == 0:
+            raise UserError(f"split {self.split} of {self.root} is empty, so it has no median image")
+        count = total if sample is None else min(sample, total)
         cache = self.root / f".median_{self.split}_{count}_{self.manifest.content[:8]}.npy"
-        with suppress(OSError, ValueError, EOFError):  # not there, or cut off by a power cut: computed anew
+        with suppress(OSError, ValueError, EOFError):  # not there, or cut off by a power cut: computed again
             return torch.from_numpy(np.load(cache))
-        median = _median(frames, (np.arange(count) * len(frames)) // count)
+        median = super().median(sample).numpy()
         draft = cache.with_name(f"{cache.name}.{os.getpid()}")
         with suppress(OSError):  # where nothing can be written, it is computed every time
             with open(draft, "wb") as file:
@@ -131,14 +156,3 @@ class P2D(Dataset[dict[str, Any]]):
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_arrays": {}}
-
-
-def _median(frames: np.ndarray, chosen: np.ndarray) -> np.ndarray:
-    """(N, H, W, 3) uint8 -> (3, H, W) float32 in [0, 1]; a few rows at a time."""
-    rows = []
-    step = max(1, 2**26 // (len(chosen) * frames.shape[2] * 3))
-    for top in range(0, frames.shape[1], step):
-        block = np.stack([frames[number, top : top + step] for number in chosen])
-        rows.append(np.median(block, axis=0))
-    median = np.concatenate(rows).astype(np.float32) / 255
-    return np.ascontiguousarray(median.transpose(2, 0, 1))

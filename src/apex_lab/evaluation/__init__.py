@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from apex_lab.evaluation.export import EXPORTS, Export, export_path
-from apex_lab.evaluation.partial import Parts, Tally
+from apex_lab.evaluation.partial import Parts, Predicted
 from apex_lab.evaluation.pictures import PICTURES_BY
 from apex_lab.evaluation.results import COLUMNS, TRACKING_COLUMNS, summary
-from apex_lab.evaluation.score import Predictor, score
+from apex_lab.evaluation.score import Tally, score
 from apex_lab.evaluation.scoring import OF_SCENES, ScoringPart
 from apex_lab.evaluation.whole import Asked, evaluate
 
@@ -19,7 +19,7 @@ __all__ = [
     "Asked",
     "Export",
     "Parts",
-    "Predictor",
+    "Predicted",
     "ScoringPart",
     "Tally",
     "evaluate",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import os
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +21,14 @@ from apex_lab.base.files import make_folder, read_json
 from apex_lab.base.validation import one_line, sentence
 from apex_lab.config import components
 from apex_lab.config import schema as config
+from apex_lab.data import VideoSource, whole_loader
 from apex_lab.evaluation.export import export_path
+from apex_lab.evaluation.other_data import OtherData
 from apex_lab.evaluation.partial import Parts
 from apex_lab.evaluation.results import summary
-from apex_lab.evaluation.score import Predictor
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.evaluation.whole import Asked, evaluate
+from apex_lab.inference.predictor import Predictor
 from apex_lab.metrics.evaluator import versions
 from apex_lab.runs import checkpoints, provenance
 from apex_lab.scene import SceneModel, schedule_at
@@ -46,6 +49,9 @@ class Request:
     accelerator: str
     folder: Path | None
     paths: config.PathsPart
+    data: OtherData = field(default_factory=OtherData)
+    batch_size: int = 4
+    chunk: int | None = None
 
 
 def find(patterns: Sequence[str]) -> list[Path]:
@@ -66,20 +72,31 @@ def find(patterns: Sequence[str]) -> list[Path]:
     return list(found.values())
 
 
-def load(file: Path, paths: config.PathsPart) -> tuple[dict[str, Any], config.Job]:
+def load(file: Path, paths: config.PathsPart, data: OtherData | None = None) -> tuple[dict[str, Any], config.Job]:
     """A checkpoint and the checked configuration that made it, with the folders of this machine.
 
+    Args:
+        file: the checkpoint.
+        paths: folders of this machine.
+        data: what stands in place of the data that the model was trained with.
+
     Raises:
-        UserError: the file is no usable checkpoint.
+        UserError: the file is no usable checkpoint, or the data's settings do not fit.
     """
     content = checkpoints.load(file)
     stored = content["config"]
     old, new = stored["paths"]["data"], paths.data
-    data = {key: new if value == old else value for key, value in stored["data"].items()}
+    own = {key: new if value == old else value for key, value in stored["data"].items()}
     try:
-        job = config.check_job({**stored, "data": data, "paths": paths.model_dump()}, content["choices"])
+        job = config.check_job(
+            {**stored, "data": own, "paths": paths.model_dump()}, content["choices"], needs_recipe=False
+        )
     except UserError as error:
         raise UserError(sentence(f"{file} was made by another version of apex_lab: {one_line(error)}")) from error
+    if data:
+        node = data.instead_of(own)
+        components.check(node, "data")
+        job = dataclasses.replace(job, config=job.config.model_copy(update={"data": node}))
     return content, job
 
 
@@ -94,7 +111,7 @@ def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
     Raises:
         UserError: the checkpoint does not fit, or another process works on it.
     """
-    content, job = load(file, request.paths)
+    content, job = load(file, request.paths, request.data)
     model = _model(file, content, job)
     with open(file, "rb") as opened:
         digest = hashlib.file_digest(opened, "sha256").hexdigest()
@@ -120,10 +137,10 @@ def _evaluate(
     folder: Path,
 ) -> None:
     device = config.device(request.accelerator)
-    data = components.build(job.config.data, "data")
-    data.prepare_data()
-    data.setup("test")
-    key = _key(request, digest, data.fingerprint, device)
+    source: VideoSource = components.build(job.config.data, "data")
+    source.prepare()
+    source.open()
+    key = _key(request, digest, source.fingerprint, device)
     view = folder / "view" / request.split
     done = None if request.again else _done(folder, request, key)
     if done is not None:
@@ -133,13 +150,14 @@ def _evaluate(
         _show(request.split, done, [folder / "metrics.json", *exported, *pictures])
         return
     parts = _parts(request, folder, key)
-    schedules = config.build_schedules(job.config)
-    schedule = schedule_at({name: value(content["step"]) for name, value in schedules.items()}, device)
+    inference = content["inference"]
+    schedule = schedule_at(inference["schedule"], device)
     asked = Asked(
         folder=folder,
         split=request.split,
         about={
-            **{"seed": job.config.seed, "step": content["step"], "data_fingerprint": data.fingerprint},
+            **{"seed": job.config.seed, "step": content["step"], "data_fingerprint": source.fingerprint},
+            **{"data": source.describe()},
             **{"checkpoint_sha256": digest, "evaluation": key},
         },
         settings={"checkpoint": str(file), "split": request.split, "videos": request.videos},
@@ -151,8 +169,9 @@ def _evaluate(
         export=request.export,
     )
     posterior = request.scoring.masks == "posterior"
-    predictor = Predictor(model, schedule, device, job.config.trainer.precision, posterior)
-    scored, paths = evaluate(asked, predictor, data.loader(request.split, request.videos), parts)
+    predictor = Predictor(model, schedule, device, inference["precision"], posterior, inference["seed"], request.chunk)
+    batches = whole_loader(source.sets[request.split], request.batch_size, request.videos)
+    scored, paths = evaluate(asked, predictor, batches, parts)
     _show(request.split, scored, [folder / "metrics.json", *paths])
 
 
@@ -192,10 +211,11 @@ def _folder(
     in_run = (run / "run.json").is_file()
     usual = request.scoring == ScoringPart()
     ended = content["step"] >= job.config.trainer.max_steps or not model.needs_training
-    if in_run and file.name == "last.ckpt" and ended and usual and request.videos is None:
+    if in_run and file.name == "last.ckpt" and ended and usual and request.videos is None and not request.data:
         return run
     words = [file.stem if in_run and ended else of_file, request.split]
     words += [] if request.videos is None else [str(request.videos)]
+    words += [f"data_{_digest(job.config.data)}"] if request.data else []
     words += [] if usual else [_digest(request.scoring.model_dump(exclude_defaults=True))]
     return (run if in_run else Path(request.paths.outputs)) / "evaluate" / "_".join(words)
 
@@ -228,13 +248,13 @@ def _parts(request: Request, folder: Path, key: str) -> Parts:
     for other in folder.glob(f".{request.split}_*"):
         if request.again or other != own:
             shutil.rmtree(other)
-    return Parts(own, request.save_interval, identities=request.export is not None)
+    return Parts(own, request.save_interval)
 
 
 def _model(file: Path, content: Mapping[str, Any], job: config.Job) -> SceneModel:
     model = config.build_model(job.config)
     try:
-        model.load_state_dict(content["weights"])
+        model.load_state_dict(content["inference"]["weights"])
     except RuntimeError as error:
         raise UserError(sentence(f"The weights in {file} do not fit its model: {one_line(error)}")) from error
     return model

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from torch.utils.data import Dataset
-
-from apex_lab.evaluation.partial import Tally
+from apex_lab.data.video_set import VideoSet
+from apex_lab.evaluation.partial import Predicted
 from apex_lab.formats import PredictedVideo, open_writer
 
 Export = Literal["npz", "coco", "weis", "davis", "mots", "mot"]
@@ -22,9 +21,7 @@ def export_path(folder: Path, split: str, format: str, truth: bool = False) -> P
     return folder / "predictions" / name
 
 
-def write(
-    folder: Path, split: str, format: str, parts: Iterable[Tally], dataset: Dataset[dict[str, Any]]
-) -> list[Path]:
+def write(folder: Path, split: str, format: str, predictions: Iterable[Predicted], videos: VideoSet) -> list[Path]:
     """Writes predictions and, in formats that keep it apart, the ground truth.
 
     The npz file has one-hot masks: each pixel belongs to the component that won it, so a score of the file is the
@@ -34,21 +31,20 @@ def write(
         folder: of the results; files go to its `predictions`.
         split: names them.
         format: one of `EXPORTS`.
-        parts: tallies that hold identities, read as often as needed.
-        dataset: where the ground truth is.
+        predictions: of all videos, read as often as needed.
+        videos: where the ground truth is; an unlabelled set has none, and only predictions are written.
 
     Returns:
         The paths, predictions first.
     """
     paths = []
-    for truth in (False,) if format == "npz" else (False, True):
+    for truth in (False,) if format == "npz" or not videos.labelled else (False, True):
         path = export_path(folder, split, format, truth)
         for draft in path.parent.glob(f".{path.name}.*"):
             draft.unlink()  # left by a kill in the middle of writing
         with open_writer(format, path, truth) as writer:
-            for part in parts:
-                for name, (identities, backgrounds) in part.identities.items():
-                    labels = dataset[part.positions[name]]["segmentation"].numpy()
-                    writer.add(PredictedVideo(name, identities, labels, background_ids=backgrounds))
+            for each in predictions:
+                labels = videos[each.position]["segmentation"].numpy() if videos.labelled else None
+                writer.add(PredictedVideo(each.name, each.identities, labels, background_ids=each.backgrounds))
         paths.append(path)
     return paths

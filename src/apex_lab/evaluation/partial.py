@@ -1,66 +1,62 @@
-"""What is known so far of an evaluation that can be killed at any time: parts on the disk, each a few videos."""
+"""What is known so far of an evaluation that can be killed at any time: predictions on the disk, a few videos a file.
+
+A file holds the identity of every pixel and little else, as plain arrays; scores, which take a millisecond a video, are
+computed from them again on resumption.
+"""
 
 from __future__ import annotations
 
-import pickle
+import io
+import json
 import shutil
-from collections.abc import Iterator
+import zipfile
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Integer
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, replacing
-from apex_lab.metrics import Evaluator, EvaluatorSettings
 
 
-@dataclass
-class Tally:
-    """Scores of some videos.
+@dataclass(frozen=True)
+class Predicted:
+    """What a model gives for one video, as far as scores and exports need it.
 
     Attributes:
-        evaluator: the scores.
-        positions: video's name -> its place in the split, in the order of scoring.
-        shares: video's name -> share of its pixels given to objects; NaN for a model that knows no background.
-        identities: video's name -> identity of every pixel and which identities are background, where they are wanted
-            for an export.
+        name: of the video.
+        position: its place in the split.
+        identities: of every pixel.
+        backgrounds: which identities are background.
+        share: share of pixels given to objects; NaN for a model without a background.
+        present: mean number of objects present per frame.
+        terms: loss terms, in nats.
     """
 
-    evaluator: Evaluator
-    positions: dict[str, int] = field(default_factory=dict)
-    shares: dict[str, float] = field(default_factory=dict)
-    identities: dict[str, tuple[Integer[np.ndarray, "T H W"], frozenset[int]]] = field(default_factory=dict)
-
-    @staticmethod
-    def empty(settings: EvaluatorSettings) -> Tally:
-        """No video yet."""
-        return Tally(Evaluator(settings))
-
-    def merge(self, other: Tally) -> None:
-        """Takes over the videos of another tally, but not their identities, which would need much memory."""
-        self.evaluator.merge(other.evaluator)
-        self.positions.update(other.positions)
-        self.shares.update(other.shares)
-
-    def __len__(self) -> int:
-        return len(self.positions)
+    name: str
+    position: int
+    identities: Integer[np.ndarray, "T H W"]
+    backgrounds: frozenset[int]
+    share: float
+    present: float
+    terms: dict[str, float] = field(default_factory=dict)
 
 
 class Parts:
-    """Tallies in a folder, in the order of the split; a part is there wholly or not at all.
+    """Predictions in a folder, in the order of the split; a part is there wholly or not at all.
 
     Args:
-        folder: of this evaluation alone: its name tells what is evaluated how.
+        folder: of this evaluation alone: its name holds what is evaluated and how.
         interval: videos per part.
-        identities: keep the identities of every pixel too.
     """
 
-    def __init__(self, folder: Path, interval: int, identities: bool = False) -> None:
-        self.folder, self.interval, self.identities = folder, interval, identities
+    def __init__(self, folder: Path, interval: int) -> None:
+        self.folder, self.interval = folder, interval
 
-    def __iter__(self) -> Iterator[Tally]:
+    def __iter__(self) -> Iterator[Predicted]:
         """Reads one part after the other.
 
         Raises:
@@ -68,26 +64,54 @@ class Parts:
         """
         for path in self._files():
             try:
-                with open(path, "rb") as file:
-                    tally = pickle.load(file)
-            except (OSError, EOFError, pickle.UnpicklingError, ValueError, AttributeError, ImportError) as error:
+                yield from _read(path)
+            except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
                 raise UserError(
                     f"{path} is damaged ({error}): remove {self.folder} and run the command again."
                 ) from error
-            if not isinstance(tally, Tally):
-                raise UserError(f"{path} is no part of an evaluation: remove {self.folder} and run the command again.")
-            yield tally
 
-    def save(self, tally: Tally) -> None:
-        """Adds a part."""
+    def save(self, predictions: Sequence[Predicted]) -> None:
+        """Adds a part.
+
+        Raises:
+            UserError: the disk is full or the folder cannot be written.
+        """
         make_folder(self.folder)
-        with replacing(self.folder / f"{len(self._files()):06d}.pickle") as file:
-            pickle.dump(tally, file, protocol=pickle.HIGHEST_PROTOCOL)
+        content: dict[str, Any] = {f"identities_{i}": predicted.identities for i, predicted in enumerate(predictions)}
+        about = [
+            {
+                "name": predicted.name,
+                "position": predicted.position,
+                "backgrounds": sorted(predicted.backgrounds),
+                "share": predicted.share,
+                "present": predicted.present,
+                "terms": predicted.terms,
+            }
+            for predicted in predictions
+        ]
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, about=np.array(json.dumps(about)), **content)
+        with replacing(self.folder / f"{len(self._files()):06d}.npz") as file:
+            file.write(buffer.getvalue())
 
     def remove(self) -> None:
-        """Removes all parts, because the evaluation is over or is to begin anew."""
+        """Removes all parts, because the evaluation is over or starts again."""
         if self.folder.exists():
             shutil.rmtree(self.folder)
 
     def _files(self) -> list[Path]:
-        return sorted(self.folder.glob("*.pickle"))
+        return sorted(self.folder.glob("*.npz"))
+
+
+def _read(path: Path) -> Iterator[Predicted]:
+    with np.load(path, allow_pickle=False) as content:
+        for i, about in enumerate(json.loads(str(content["about"]))):
+            yield Predicted(
+                name=about["name"],
+                position=about["position"],
+                identities=content[f"identities_{i}"],
+                backgrounds=frozenset(about["backgrounds"]),
+                share=about["share"],
+                present=about["present"],
+                terms=about["terms"],
+            )

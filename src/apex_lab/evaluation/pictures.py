@@ -11,7 +11,8 @@ from torch.utils.data import default_collate
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder
-from apex_lab.evaluation.score import Batches, Predictor
+from apex_lab.data.video_set import VideoSet
+from apex_lab.inference.predictor import Predictor
 from apex_lab.metrics import KEYS
 from apex_lab.view import Item, render_all
 from apex_lab.view.curves import has_rows
@@ -55,13 +56,20 @@ def choose(rows: Sequence[Mapping[str, Any]], count: int, key: str = PICTURES_BY
     return found
 
 
+def spread(names: Sequence[str], count: int) -> list[Chosen]:
+    """Videos of an unlabelled set, which no score ranks: evenly spaced ones."""
+    count = min(count, len(names))
+    ranks = [round(i * (len(names) - 1) / max(count - 1, 1)) for i in range(count)]
+    return [Chosen("video", names[rank], math.nan) for rank in ranks]
+
+
 def draw(
     folder: Path,
     chosen: Sequence[Chosen],
     key: str,
     positions: Mapping[str, int],
     predictor: Predictor,
-    batches: Batches,
+    videos: VideoSet,
     curves: Path | None = None,
 ) -> list[Path]:
     """Asks the model for the chosen videos once more and draws them; the pictures' paths, the film strip first.
@@ -74,16 +82,17 @@ def draw(
         key: one of `apex_lab.metrics.KEYS`.
         positions: video name -> place in the data set.
         predictor: the model.
-        batches: of the data set.
+        videos: the data set.
         curves: the run's table of curves.
     """
     if not chosen:
         return []
     items = []
     for title, name, value in chosen:
-        batch = default_collate([batches.dataset[positions[name]]])
-        scene = one_video(predictor(batch), 0)
-        items.append(Item(f"{title} {name} ({key} {value:.2f})", batch["video"], scene, 0, batch["segmentation"]))
+        batch = default_collate([videos[positions[name]]])
+        scene = one_video(predictor(batch, detail=True), 0)
+        caption = f"{title} {name}" if math.isnan(value) else f"{title} {name} ({key} {value:.2f})"
+        items.append(Item(caption, batch["video"], scene, 0, batch.get("segmentation")))
     for old in make_folder(folder).glob("components_*.png"):
         old.unlink()
     return render_all(folder, items, curves if curves is not None and has_rows(curves) else None)

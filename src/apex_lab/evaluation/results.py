@@ -10,8 +10,8 @@ from typing import Any
 import pandas as pd
 
 from apex_lab.base.files import make_folder, read_json, write_json, write_text
-from apex_lab.evaluation.partial import Tally
 from apex_lab.evaluation.pictures import Chosen
+from apex_lab.evaluation.score import Tally
 from apex_lab.formats.scored_files import plain
 from apex_lab.metrics import by_property
 
@@ -36,12 +36,14 @@ def store(
 ) -> dict[str, Any]:
     """Writes the scores of a split; what metrics.json holds of other splits stays.
 
-    metrics.json holds under `splits` and the split's name: `videos` and `frames` (how many), `foreground_share` (mean
-    share of pixels given to objects), `settings` (what was asked for and how it was scored), `versions`, `seed` and
-    what else `about` holds, `total` and `per_video` (scores under the keys of `apex_lab.metrics.KEYS`), `hota_alpha`,
-    `by_property` (where does the model fail: mean results of objects alike in class, size, occlusion or contact) and
-    `pictures` (which videos were drawn). `settings` and `versions` also stand at the top, of the split written last.
-    An undefined score is null. per_video_<split>.csv and objects_<split>.csv hold a row per video and per true object.
+    metrics.json holds under `splits` and the split's name: `videos` and `frames` (how many), `labelled` (whether there
+    is a ground truth), `foreground_share` (mean share of pixels given to objects), `objects_present` (mean number per
+    frame), `terms` (loss terms, mean over videos), `settings` (what was asked for and how it was scored), `data` (which
+    data were scored), `versions`, `seed` and what else `about` holds, `total` and `per_video` (scores under the keys of
+    `apex_lab.metrics.KEYS`), `hota_alpha`, `by_property` (where does the model fail: mean results of objects alike in
+    class, size, occlusion or contact) and `pictures` (which videos were drawn). `settings` and `versions` also stand at
+    the top, of the split written last. An undefined score is null. per_video_<split>.csv and objects_<split>.csv hold a
+    row per video and per true object.
 
     Args:
         folder: where to.
@@ -57,13 +59,22 @@ def store(
     """
     path = make_folder(folder) / "metrics.json"
     content = read_json(path) if path.exists() else {}
-    videos = [{**row, "foreground_share": tally.shares[row["video"]]} for row in result["per_video"]]
-    known = [share for share in tally.shares.values() if not math.isnan(share)]
+    videos = [
+        {
+            **row,
+            "foreground_share": tally.shares[row["video"]],
+            "objects_present": tally.present[row["video"]],
+        }
+        for row in result["per_video"]
+    ]
     scored = plain(
         {
             "videos": result["total"]["videos"],
             "frames": result["total"]["frames"],
-            "foreground_share": math.fsum(known) / len(known) if known else None,
+            "labelled": len(result["per_video"]) == len(tally.evaluator.records),
+            "foreground_share": tally.mean_share(),
+            "objects_present": math.fsum(tally.present.values()) / len(tally) if len(tally) else None,
+            "terms": tally.mean_terms(),
             **about,
             "versions": result["versions"],
             "total": result["total"],
@@ -80,6 +91,14 @@ def store(
     return scored
 
 
+def unlabelled(tally: Tally) -> dict[str, Any]:
+    """What stands in the place of `Evaluator.result()` for videos without ground truth: no score at all."""
+    per_video = [{"video": name, "frames": tally.frames[name]} for name in sorted(tally.positions)]
+    empty = tally.evaluator.result()
+    total = {"videos": len(tally), "frames": sum(tally.frames.values())}
+    return {**empty, "total": total, "per_video": per_video, "hota_alpha": None}
+
+
 def summary(title: str, total: Mapping[str, Any]) -> str:
     """What was scored, and the paper's numbers under their headings; tracking where there is any.
 
@@ -88,6 +107,8 @@ def summary(title: str, total: Mapping[str, Any]) -> str:
         total: scores of all videos together; None where one is undefined.
     """
     lines = [f"{title}: {total['videos']} videos, {total['frames']} frames"]
+    if not any(key in total for key in COLUMNS):
+        return f"{lines[0]}; unlabelled, so there are no scores"
     for columns, digits in ((COLUMNS, 3), (TRACKING_COLUMNS, 1)):
         values = [total.get(key) for key in columns]
         if columns is COLUMNS or any(value is not None for value in values):

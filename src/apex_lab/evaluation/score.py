@@ -1,93 +1,177 @@
-"""From a model and batches to a tally, one batch in memory at a time."""
+"""From a model and batches to scores, one batch in memory at a time: the one scoring path, of validation too."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, Subset
+from jaxtyping import Int
+from torch import Tensor
+from torch.utils.data import DataLoader, Subset
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.progress import Meter
 from apex_lab.base.validation import one_line
-from apex_lab.evaluation.partial import Parts, Tally
+from apex_lab.data.video_set import Item, VideoSet
+from apex_lab.evaluation.partial import Parts, Predicted
 from apex_lab.evaluation.scoring import ScoringPart
-from apex_lab.formats import p2d_video_name
-from apex_lab.metrics import ObjectMetadata, background_identities, p2d_metadata, scene_identities
-from apex_lab.scene import Scene, SceneModel, Schedule
-from apex_lab.training.learner import Batch, as_float, foreground_share
+from apex_lab.inference.predictor import Batch, Predictor
+from apex_lab.metrics import Evaluator, EvaluatorSettings, background_identities, scene_identities
+from apex_lab.scene import ABSENT
 
-Batches = DataLoader[dict[str, Any]]
+Batches = DataLoader[Item]
 
 
-class Predictor:
-    """A model ready to be asked, in evaluation mode.
+@dataclass
+class Tally:
+    """Scores of some videos.
 
-    Args:
-        model: moved to `device`.
-        schedule: values the model is called with, on `device`.
-        device: where the model runs.
-        precision: 32 or "bf16-mixed".
-        posterior: scenes come with `SceneModel.posterior` as their masks.
+    Attributes:
+        evaluator: the scores; holds no video of an unlabelled set.
+        positions: video's name -> its place in the split, in the order of scoring.
+        frames: video's name -> how many it has.
+        shares, present, terms: video's name -> as in `Predicted`.
     """
 
-    def __init__(
-        self,
-        model: SceneModel,
-        schedule: Schedule,
-        device: torch.device,
-        precision: int | str = 32,
-        posterior: bool = False,
-    ) -> None:
-        self.model, self.posterior = model.to(device).eval(), posterior
-        self.schedule, self.device, self.precision = schedule, device, precision
+    evaluator: Evaluator
+    positions: dict[str, int] = field(default_factory=dict)
+    frames: dict[str, int] = field(default_factory=dict)
+    shares: dict[str, float] = field(default_factory=dict)
+    present: dict[str, float] = field(default_factory=dict)
+    terms: dict[str, dict[str, float]] = field(default_factory=dict)
 
-    @torch.no_grad()
-    def __call__(self, batch: Batch) -> Scene:
-        """The scene of a batch; a model that reads the ground truth is given it."""
-        video = as_float(batch["video"].to(self.device))
-        if self.model.needs_labels:
-            return self.model.from_labels(video, batch["segmentation"].to(self.device).long())
-        with torch.autocast(video.device.type, dtype=torch.bfloat16, enabled=self.precision == "bf16-mixed"):
-            scene = self.model(video, self.schedule)
-        if not self.posterior:
-            return scene
-        return dataclasses.replace(scene, masks=self.model.posterior(scene, video, self.schedule))
+    @staticmethod
+    def empty(settings: EvaluatorSettings) -> Tally:
+        """No video yet."""
+        return Tally(Evaluator(settings))
+
+    def add(self, predicted: Predicted, videos: VideoSet, truth: np.ndarray | None = None) -> None:
+        """Scores one video.
+
+        Args:
+            predicted: of the video.
+            videos: where its ground truth and metadata are.
+            truth: (T, H, W) its labels; None reads them from `videos`.
+
+        Raises:
+            UserError: the prediction cannot be scored.
+        """
+        name = predicted.name
+        if videos.labelled:
+            labels = videos[predicted.position]["segmentation"].numpy() if truth is None else truth
+            about = videos.metadata(predicted.position)
+            try:
+                self.evaluator.add(name, predicted.identities, labels, about, set(predicted.backgrounds))
+            except ValueError as error:
+                raise UserError(f"The model's output for {name} cannot be scored: {one_line(error)}.") from error
+        self.positions[name] = predicted.position
+        self.frames[name] = len(predicted.identities)
+        self.shares[name], self.present[name] = predicted.share, predicted.present
+        self.terms[name] = predicted.terms
+
+    def merge(self, other: Tally) -> None:
+        """Takes over the videos of another tally."""
+        self.evaluator.merge(other.evaluator)
+        self.positions.update(other.positions)
+        self.frames.update(other.frames)
+        self.shares.update(other.shares)
+        self.present.update(other.present)
+        self.terms.update(other.terms)
+
+    def mean_terms(self) -> dict[str, float]:
+        """Loss terms, averaged over videos in the order of the split."""
+        names = sorted(self.positions, key=lambda name: self.positions[name])
+        keys = self.terms[names[0]] if names else {}
+        return {key: math.fsum(self.terms[name][key] for name in names) / len(names) for key in keys}
+
+    def mean_share(self) -> float | None:
+        """Share of pixels given to objects, averaged over videos; None for a model without a background."""
+        known = [share for share in self.shares.values() if not math.isnan(share)]
+        return math.fsum(known) / len(known) if known else None
+
+    def __len__(self) -> int:
+        return len(self.positions)
 
 
-def score(
-    predictor: Predictor, batches: Batches, split: str, scoring: ScoringPart, parts: Parts | None = None
-) -> Tally:
-    """Scores every video; what stands in `parts` is not done again.
+def score(predictor: Predictor, batches: Batches, scoring: ScoringPart, parts: Parts | None = None) -> Tally:
+    """Scores every video; what stands in `parts` is not predicted again.
 
     Args:
         predictor: the model.
-        batches: in order, as the data module gives them.
-        split: gives the videos their names.
+        batches: whole videos in order.
         scoring: how.
-        parts: where what is done is kept; None keeps it in memory alone.
+        parts: where predictions are kept; None keeps none.
 
     Raises:
         UserError: the model's output cannot be scored; names the video.
     """
-    settings = scoring.settings(predictor.model.tracks)
-    done, fresh = Tally.empty(settings), Tally.empty(settings)
-    for part in parts or ():
-        done.merge(part)
-    with Meter("video", length(batches), len(done)) as meter:
-        for batch in _rest(batches, len(done)):
-            _add(fresh, predictor, batch, split, scoring, batches, len(done), parts is not None and parts.identities)
-            meter.show(len(done) + len(fresh))
+    tally = Tally.empty(scoring.settings(predictor.model.tracks))
+    videos = video_set(batches)
+    for predicted in parts or ():
+        tally.add(predicted, videos)
+    fresh: list[Predicted] = []
+    with Meter("video", length(batches), len(tally)) as meter:
+        for batch in _rest(batches, len(tally)):
+            fresh += add_batch(tally, predictor, batch, videos, scoring)
+            meter.show(len(tally))
             if parts is not None and len(fresh) >= parts.interval:
                 parts.save(fresh)
-                done.merge(fresh)
-                fresh = Tally.empty(settings)
-    if parts is not None and len(fresh):
+                fresh = []
+    if parts is not None and fresh:
         parts.save(fresh)
-    done.merge(fresh)
-    return done
+    return tally
+
+
+def add_batch(
+    tally: Tally, predictor: Predictor, batch: Batch, videos: VideoSet, scoring: ScoringPart
+) -> list[Predicted]:
+    """Predicts and scores one batch; returns the predictions."""
+    found = list(predict(predictor, batch, scoring))
+    for b, predicted in enumerate(found):
+        tally.add(predicted, videos, batch["segmentation"][b].numpy() if videos.labelled else None)
+    return found
+
+
+def predict(predictor: Predictor, batch: Batch, scoring: ScoringPart) -> Iterator[Predicted]:
+    """The model's output for each video of a batch.
+
+    Raises:
+        UserError: pixels that belong to no identity.
+    """
+    scene = predictor(batch)
+    labels = batch.get("segmentation")
+    size = batch["video"].shape[-2:] if labels is None else labels.shape[-2:]
+    try:
+        identities = scene_identities(scene, tuple(size), scoring.min_presence, scoring.presence_after)
+    except ValueError as error:
+        raise UserError(f"The model's output for {batch['name'][0]} cannot be scored: {one_line(error)}.") from error
+    backgrounds = background_identities(scene)
+    shares = foreground_share(backgrounds, identities).tolist() if bool(scene.background.any()) else None
+    present = ((scene.presence >= scoring.min_presence) & (scene.ids != ABSENT) & ~scene.background).float().sum(-1)
+    terms = {name: values.float().tolist() for name, values in scene.terms.items()}
+    maps = identities.cpu().numpy()
+    for b, name in enumerate(batch["name"]):
+        yield Predicted(
+            name=name,
+            position=int(batch["index"][b]),
+            identities=maps[b],
+            backgrounds=frozenset(backgrounds[b]),
+            share=math.nan if shares is None else shares[b],
+            present=float(present[b].mean()),
+            terms={key: values[b] for key, values in terms.items()},
+        )
+
+
+def foreground_share(backgrounds: Sequence[set[int]], identities: Int[Tensor, "B T H W"]) -> Tensor:
+    """Share of a video's pixels that the model gives to objects, not to its background, (B,)."""
+    given = [
+        torch.isin(video, video.new_tensor(sorted(ids))) for video, ids in zip(identities, backgrounds, strict=True)
+    ]
+    return torch.stack([1.0 - background.float().mean() for background in given])
 
 
 def length(batches: Batches) -> int:
@@ -95,8 +179,17 @@ def length(batches: Batches) -> int:
     return len(batches.dataset)  # type: ignore[arg-type]
 
 
+def video_set(batches: DataLoader[Any]) -> VideoSet:
+    """The set that a loader reads."""
+    data = batches.dataset
+    while isinstance(data, Subset):
+        data = data.dataset
+    assert isinstance(data, VideoSet)
+    return data
+
+
 def _rest(batches: Batches, done: int) -> Batches:
-    """The batches after the first `done` videos, composed as they would have been without a break."""
+    """The batches after the first `done` videos."""
     if done == 0:
         return batches
     return DataLoader(
@@ -106,45 +199,3 @@ def _rest(batches: Batches, done: int) -> Batches:
         pin_memory=batches.pin_memory,
         collate_fn=batches.collate_fn,
     )
-
-
-def _add(
-    tally: Tally,
-    predictor: Predictor,
-    batch: Batch,
-    split: str,
-    scoring: ScoringPart,
-    batches: Batches,
-    done: int,
-    keep: bool,
-) -> None:
-    """Scores one batch."""
-    scene = predictor(batch)
-    truth = batch["segmentation"].numpy()
-    names = [p2d_video_name(split, index) for index in batch["index"].tolist()]
-    try:
-        identities = scene_identities(scene, truth.shape[-2:], scoring.min_presence, scoring.presence_after)
-    except ValueError as error:
-        raise UserError(f"The model's output for {', '.join(names)} cannot be scored: {one_line(error)}.") from error
-    known = bool(scene.background.any())
-    shares = foreground_share(scene, identities).tolist() if known else [math.nan] * len(names)
-    backgrounds = background_identities(scene)
-    maps = identities.cpu().numpy()
-    for b, name in enumerate(names):
-        about = _metadata(batches.dataset, int(batch["index"][b]))
-        try:
-            tally.evaluator.add(name, maps[b], truth[b], about, backgrounds[b])
-        except ValueError as error:
-            raise UserError(f"The model's output for {name} cannot be scored: {one_line(error)}.") from error
-        tally.positions[name] = done + len(tally)
-        tally.shares[name] = shares[b]
-        if keep:
-            tally.identities[name] = (maps[b], frozenset(backgrounds[b]))
-
-
-def _metadata(dataset: Dataset[dict[str, Any]], index: int) -> ObjectMetadata | None:
-    """What the data set knows of a video's objects, if it says anything (`P2D.meta`)."""
-    while isinstance(dataset, Subset):
-        dataset = dataset.dataset
-    meta = getattr(dataset, "meta", None)
-    return None if meta is None else p2d_metadata(meta(index))

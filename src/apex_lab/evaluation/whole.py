@@ -12,8 +12,9 @@ from apex_lab.evaluation import pictures
 from apex_lab.evaluation import results as record
 from apex_lab.evaluation.partial import Parts
 from apex_lab.evaluation.pictures import PICTURES_BY
-from apex_lab.evaluation.score import Batches, Predictor, score
+from apex_lab.evaluation.score import Batches, score, video_set
 from apex_lab.evaluation.scoring import ScoringPart
+from apex_lab.inference.predictor import Predictor
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Asked:
         pictures_by: what ranks videos for that.
         view: where pictures go.
         curves: a table of curves to draw too.
-        export: format to write predictions in; needs parts that keep identities.
+        export: format to write predictions in; needs parts.
     """
 
     folder: Path
@@ -61,16 +62,19 @@ def evaluate(
     Returns:
         What metrics.json holds of the split, and the paths of exports and pictures, film strip first among those.
     """
-    tally = score(predictor, batches, asked.split, asked.scoring, parts)
-    result = tally.evaluator.result()
-    chosen = pictures.choose(result["per_video"], asked.pictures, asked.pictures_by)
+    videos = video_set(batches)
+    tally = score(predictor, batches, asked.scoring, parts)
+    result = tally.evaluator.result() if videos.labelled else record.unlabelled(tally)
+    if videos.labelled:
+        chosen = pictures.choose(result["per_video"], asked.pictures, asked.pictures_by)
+    else:
+        chosen = pictures.spread(list(tally.positions), asked.pictures)
     view = asked.view or asked.folder / "view"
-    drawn = pictures.draw(view, chosen, asked.pictures_by, tally.positions, predictor, batches, asked.curves)
+    drawn = pictures.draw(view, chosen, asked.pictures_by, tally.positions, predictor, videos, asked.curves)
     written = []
     if asked.export is not None:
         assert parts is not None
-        assert parts.identities
-        written = exports.write(asked.folder, asked.split, asked.export, parts, batches.dataset)
+        written = exports.write(asked.folder, asked.split, asked.export, parts, videos)
     about = {**asked.about, "settings": {**asked.settings, "scoring": asked.scoring.stored(predictor.model.tracks)}}
     scored = record.store(asked.folder, asked.split, tally, result, about, chosen, asked.beside)
     if parts is not None:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Integer
 
 from apex_lab.base.errors import UserError
-from apex_lab.data.p2d import P2D
+from apex_lab.data.p2d import P2D, p2d_video_name
 from apex_lab.formats.davis import read_davis, video_names
 from apex_lab.formats.npz import NpzFile
 from apex_lab.metrics.objects import ObjectMetadata, p2d_metadata
@@ -73,11 +73,6 @@ class DavisTruth:
 
     def metadata(self, name: str) -> None:
         """Nothing is known."""
-
-
-def p2d_video_name(split: str, index: int) -> str:
-    """What a P2D video is called in files of predictions and results."""
-    return f"{split}_{index:05d}"
 
 
 def open_truth(path: str | Path, split: str = "test") -> Truth:

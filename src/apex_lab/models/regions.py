@@ -5,11 +5,14 @@ Legend: B videos, T frames, K components, H, W image height and width. Component
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from apex_lab.models.linking import link
+from apex_lab.models.linking import Linked, link
 from apex_lab.scene import ABSENT, Scene
 
 BACKGROUND_ID = 0
@@ -33,6 +36,7 @@ def scene_of_regions(
     labels: Int[Tensor, "B T H W"],
     components: int,
     background: Float[Tensor, "3 H W"] | None = None,
+    state: Sequence[Linked] | None = None,
 ) -> Scene:
     """A scene of hard masks: every region is its mean colour, linked over time by `link`.
 
@@ -41,7 +45,8 @@ def scene_of_regions(
         labels: component of every pixel, 0 (background) .. `components` - 1; which number an object has in a frame
             carries no meaning.
         components: K, the same for every video.
-        background: picture of the background, RGB in [0, 1]; None paints it in its mean colour.
+        background: image of the background, RGB in [0, 1]; None paints it in its mean colour.
+        state: `Scene.state` of the frames before; None at the start.
 
     Returns:
         A scene without loss terms and windows. `appearance` is the mean RGB (A = 3).
@@ -49,13 +54,16 @@ def scene_of_regions(
     masks = one_hot(labels, components)
     colors = mean_colors(video, masks)
     ids = torch.full(masks.shape[:3], BACKGROUND_ID, dtype=torch.long, device=video.device)
+    linked = []
     for b in range(len(video)):
-        found = link(masks[b, :, 1:].cpu().numpy(), colors[b, :, 1:].cpu().numpy())
+        before = None if state is None else state[b]
+        found, last = link(masks[b, :, 1:].cpu().numpy(), colors[b, :, 1:].cpu().numpy(), before=before)
+        linked.append(last)
         ids[b, :, 1:] = torch.from_numpy(found).to(video.device)
     means = colors[..., None, None].expand(*masks.shape[:3], *video.shape[2:])
     if background is not None:
         means = torch.cat([background.expand_as(means[:, :, :1]), means[:, :, 1:]], dim=2)
-    return hard_scene(labels, masks, ids, colors, means)
+    return dataclasses.replace(hard_scene(labels, masks, ids, colors, means), state=linked)
 
 
 def hard_scene(

@@ -46,14 +46,22 @@ class RankNoise(Noise):
         self._videos, self._first, self._total = videos, first, total
 
     def normal(self, like: Tensor) -> Tensor:
-        return self._rows(torch.randn, like)
+        return self._rows(self._global(like).normal_())
 
     def uniform(self, like: Tensor) -> Tensor:
-        return self._rows(torch.rand, like)
+        return self._rows(self._global(like).uniform_())
 
-    def _rows(self, draw: Draw, like: Tensor) -> Tensor:
+    def _global(self, like: Tensor) -> Tensor:
+        """An empty tensor for the global batch, in memory as one in the shape of `like` would be."""
         each = rows_each(like, self._videos)
-        whole = draw((self._total * each, *like.shape[1:]), dtype=like.dtype, device=like.device)
+        alone = torch.empty_like(like)
+        size, strides = (self._total * each, *like.shape[1:]), alone.stride()
+        if any(strides[0] < stride for stride in strides[1:]):  # videos are not slowest in memory
+            return torch.empty(size, dtype=like.dtype, device=like.device)
+        return torch.empty_strided(size, strides, dtype=like.dtype, device=like.device)
+
+    def _rows(self, whole: Tensor) -> Tensor:
+        each = len(whole) // self._total
         return whole[self._first * each : (self._first + self._videos) * each]
 
 

@@ -2,12 +2,14 @@
 
 A checkpoint is a dictionary of plain values and tensors, readable with `torch.load(path, weights_only=True)`:
 
-    format    version of this layout
-    step      weight updates made
-    weights   the model's state_dict
-    config    resolved configuration (plain containers)
-    choices   configuration group -> word chosen
-    training  optimiser state, seconds so far, best score, data's fingerprint; None where only evaluation is meant
+    format     version of this layout (`apex_lab.config.upgrades.FORMAT`)
+    step       weight updates made
+    inference  all that a prediction needs: `model` (the configuration node that builds it), `weights` (its state_dict),
+               `schedule` (name -> value at this step), `attributes` (of `SceneModel`), `precision`, `seed`
+    config     resolved configuration (plain containers)
+    choices    configuration group -> word chosen
+    training   all that resuming needs besides: states of optimiser and callbacks, seconds so far, best score, data's
+               fingerprint; None where only evaluation is meant
 """
 
 from __future__ import annotations
@@ -21,9 +23,31 @@ import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import replacing, unwritable
+from apex_lab.config import components
+from apex_lab.config.schema import Config, build_schedules
+from apex_lab.config.upgrades import FORMAT, upgraded
+from apex_lab.scene import SceneModel
 
-FORMAT = 1
-_KEYS = {"format", "step", "weights", "config", "choices", "training"}
+_KEYS = {
+    1: {"format", "step", "weights", "config", "choices", "training"},
+    2: {"format", "step", "inference", "config", "choices", "training"},
+}
+"""Format -> entries."""
+
+ATTRIBUTES = ("tracks", "streams", "needs_labels", "needs_training", "has_posterior", "input_size")
+"""Of `SceneModel`, kept beside the weights."""
+
+
+def inference_part(config: Config, model: SceneModel, step: int) -> dict[str, Any]:
+    """The `inference` entry of a checkpoint of a model after `step` weight updates."""
+    return {
+        "model": config.model,
+        "weights": {name: value.detach().cpu() for name, value in model.state_dict().items()},
+        "schedule": {name: float(schedule(step)) for name, schedule in build_schedules(config).items()},
+        "attributes": {name: getattr(model, name) for name in ATTRIBUTES},
+        "precision": config.trainer.precision,
+        "seed": config.seed,
+    }
 
 
 def save(path: Path, checkpoint: dict[str, Any], keep_previous: bool = False) -> None:
@@ -38,7 +62,7 @@ def save(path: Path, checkpoint: dict[str, Any], keep_previous: bool = False) ->
         UserError: the disk is full or the folder cannot be written.
     """
     content = {"format": FORMAT, **checkpoint}
-    assert set(content) == _KEYS
+    assert set(content) == _KEYS[FORMAT]
     with replacing(path, keep=previous(path) if keep_previous else None) as file:
         try:
             torch.save(content, file)
@@ -74,14 +98,46 @@ def load(path: Path) -> dict[str, Any]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, RuntimeError, EOFError, KeyError, ValueError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
         raise UserError(f"{path} is damaged or no checkpoint ({type(error).__name__}): use another one.") from error
-    if not isinstance(content, dict) or set(content) != _KEYS:
+    if not isinstance(content, dict) or "format" not in content or "weights" not in {**content, **_inside(content)}:
         raise UserError(f"{path} is no apex_lab checkpoint: give a .ckpt file of a run, or the run's folder.")
-    if content["format"] != FORMAT:
+    if content["format"] not in _KEYS:
         raise UserError(
-            f"{path} has format {content['format']}, this version of apex_lab reads {FORMAT}: "
+            f"{path} has format {content['format']}, this version of apex_lab reads {', '.join(map(str, _KEYS))}: "
             "use the version that wrote it."
         )
-    sick = [name for name, weight in content["weights"].items() if not torch.isfinite(weight).all()]
+    if set(content) != _KEYS[content["format"]]:
+        raise UserError(f"{path} is no apex_lab checkpoint: give a .ckpt file of a run, or the run's folder.")
+    content = _upgraded(content)
+    weights = content["inference"]["weights"]
+    sick = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
     if sick:
         raise UserError(f"{path} holds weights that are not finite ({sick[0]}): its run diverged; use an earlier one.")
     return content
+
+
+def _inside(content: dict[str, Any]) -> dict[str, Any]:
+    inside = content.get("inference")
+    return inside if isinstance(inside, dict) else {}
+
+
+def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
+    """A checkpoint of an older format in today's layout."""
+    if content["format"] == FORMAT:
+        return content
+    config, step = upgraded(content["config"], content["format"]), content["step"]
+    schedules = {name: components.build(node, f"schedule.{name}") for name, node in config["schedule"].items()}
+    return {
+        "format": FORMAT,
+        "step": step,
+        "inference": {
+            "model": config["model"],
+            "weights": content["weights"],
+            "schedule": {name: float(schedule(step)) for name, schedule in schedules.items()},
+            "attributes": {},
+            "precision": config["trainer"]["precision"],
+            "seed": config["seed"],
+        },
+        "config": config,
+        "choices": content["choices"],
+        "training": content["training"],
+    }

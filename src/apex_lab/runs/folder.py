@@ -13,14 +13,12 @@ seeds of one configuration stand beside each other, and a changed configuration 
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Mapping
-from copy import deepcopy
+import os
+import socket
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import yaml
@@ -29,46 +27,47 @@ from filelock import FileLock, Timeout
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, read_json, write_json, write_text
 from apex_lab.config.schema import Job
+from apex_lab.config.upgrades import FORMAT, fingerprint, upgraded
 from apex_lab.runs import provenance
-
-HARMLESS = (
-    "seed",
-    "paths",
-    "logger",
-    "callbacks.progress",
-    "data.root",
-    "data.seed",
-    "data.workers",
-    "data.generate",
-    "data.sim_workers",
-    "data.verify",
-    "trainer.accelerator",
-    "trainer.log_interval",
-    "trainer.checkpoint_interval",
-    "evaluation.pictures",
-)
-"""Keys that do not belong to a run's fingerprint: a run goes on, or is finished, whatever they say."""
-
-
-def fingerprint(config: Mapping[str, Any]) -> str:
-    """Hexadecimal digest of a resolved configuration without its harmless keys."""
-    content = deepcopy(dict(config))
-    for key in HARMLESS:
-        group, _, name = key.partition(".")
-        (content.get(group) or {} if name else content).pop(name or group, None)
-    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(canonical.encode()).hexdigest()
 
 
 def group_name(job: Job) -> str:
     """Name of the configuration, common to all its seeds."""
-    words = [job.choices.get(group) for group in ("model", "ablation", "data", "scale")]
-    return "_".join([word for word in words if word] + [fingerprint(job.raw)[:8]])
+    return f"{_words(job)}_{fingerprint(job.raw)[:8]}"
 
 
 def run_folder(job: Job) -> Path:
-    """Where a job's run lies."""
-    return Path(job.config.paths.outputs) / group_name(job) / f"seed_{job.config.seed}"
+    """Where a job's run lies: the folder of its name, or one of an older version with the same identity."""
+    outputs, seed = Path(job.config.paths.outputs), f"seed_{job.config.seed}"
+    named = outputs / group_name(job) / seed
+    if not named.exists():
+        for older in sorted(outputs.glob(f"{_words(job)}_*/{seed}/{RECORD}")):
+            if _same_run(older.parent, job):
+                return older.parent
+    return named
+
+
+def _words(job: Job) -> str:
+    words = [job.choices.get(group) for group in ("model", "ablation", "data", "scale")]
+    return "_".join(word for word in words if word)
+
+
+def _same_run(folder: Path, job: Job) -> bool:
+    """Whether a folder that an older version of apex_lab named holds this job's run."""
+    try:
+        format = read_json(folder / RECORD).get("format", 1)
+        if not isinstance(format, int) or not 1 <= format < FORMAT:
+            return False
+        stored = yaml.safe_load((folder / "config.yaml").read_text())
+        return fingerprint(upgraded(stored, format)) == fingerprint(job.raw)
+    except (UserError, OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError):
+        return False  # damaged, so it cannot be recognised
+
+
+RECORD = "run.json"
+
+Outcome = Literal["finished", "failed", "interrupted", "diverged"]
+"""How a run's last attempt ended; null in the record while it is running."""
 
 
 @dataclass
@@ -115,7 +114,7 @@ class Run:
 
     @property
     def record_file(self) -> Path:
-        return self.folder / "run.json"
+        return self.folder / RECORD
 
     @property
     def metrics_file(self) -> Path:
@@ -152,8 +151,13 @@ class Run:
         history = [*self.record.get("history", []), {"started": now, "command": command, "commit": commit}]
         self.record = {
             **self.record,
+            "format": FORMAT,
             "status": "running",
+            "outcome": None,
             "reason": None,
+            "host": socket.gethostname(),
+            "pid": os.getpid(),
+            "heartbeat": now,
             "started": history[0]["started"],
             "finished": None,
             "seconds": self.record.get("seconds", 0.0),  # of training, over all restarts
@@ -178,13 +182,17 @@ class Run:
         self.record.update(entries)
         self.save()
 
+    def beat(self, **entries: Any) -> None:
+        """Changes entries of the record, and shows that the process is alive."""
+        self.update(**entries, heartbeat=_now())
+
     def finish(self) -> None:
         """Records that everything is done."""
-        self.update(status="finished", reason=None, finished=_now())
+        self.update(status="finished", outcome="finished", reason=None, finished=_now())
 
-    def fail(self, reason: str) -> None:
-        """Records why work ended early; the same command goes on from the last checkpoint."""
-        self.update(status="failed", reason=reason, finished=_now())
+    def fail(self, reason: str, outcome: Outcome = "failed") -> None:
+        """Records why work ended early; the same command resumes from the last checkpoint."""
+        self.update(status="failed", outcome=outcome, reason=reason, finished=_now())
 
     def save(self) -> None:
         """Writes run.json."""

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from apex_lab.runs.folder import HARMLESS
+from apex_lab.config.upgrades import EXCLUDED
 from apex_lab.tables.found import Protocol, SeedRun, listed, run_words
 
 T = TypeVar("T")
@@ -211,4 +211,4 @@ def _changes(runs: Iterable[SeedRun]) -> tuple[str, ...]:
 def _harmless(word: str) -> bool:
     """Whether a word chooses what a run is named by, or something that cannot change a result."""
     key = word.split("=", 1)[0].lstrip("+~")
-    return key in NAMING or any(key == name or key.startswith(f"{name}.") for name in (*HARMLESS, "hydra"))
+    return key in NAMING or any(key == name or key.startswith(f"{name}.") for name in (*EXCLUDED, "hydra"))

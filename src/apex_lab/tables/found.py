@@ -42,6 +42,7 @@ class Record(BaseModel):
     experiment: str | None = None
     seed: int
     reason: str | None = None
+    outcome: str | None = None
     started: str | None = None
     overrides: tuple[str, ...] = ()
     fingerprint: str | None = None
@@ -142,7 +143,10 @@ def read_run(folder: Path, seed: int) -> SeedRun:
     except UserError as error:
         return SeedRun(folder, seed, None, "damaged", str(error))
     if record.status != "finished":
-        diverged = record.status == "failed" and DIVERGED.search(record.reason or "") is not None
+        # runs of format 1 have no outcome: their reason tells
+        diverged = record.outcome == "diverged" or (
+            record.outcome is None and record.status == "failed" and DIVERGED.search(record.reason or "") is not None
+        )
         why = f"its last word is: {sentence(record.reason)}" if record.reason else f"its status is '{record.status}'."
         return SeedRun(folder, seed, record, "diverged" if diverged else "unfinished", why)
     try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import lightning as L
@@ -18,9 +19,9 @@ from apex_lab.training.learner import Learner
 
 
 class Checkpoints(L.Callback):
-    """Keeps last.ckpt (to go on from), the one before it, and best.ckpt (highest or lowest validation score).
+    """Keeps last.ckpt (to resume from), the one before it, and best.ckpt (highest or lowest validation score).
 
-    A step at which validation is due is stored after validation, so that going on from it repeats or misses none.
+    A step at which validation is due is stored after validation, so that resuming from it repeats or misses none.
 
     Args:
         run: whose folder the files lie in.
@@ -30,7 +31,7 @@ class Checkpoints(L.Callback):
         monitor: name of the validation score.
         mode: which end of it is best.
         deferred: a request to stop, acted on when the step at hand is stored.
-        training: `training` entry of the checkpoint that this run goes on from.
+        training: `training` entry of the checkpoint that this run resumes from.
     """
 
     def __init__(
@@ -42,7 +43,7 @@ class Checkpoints(L.Callback):
         monitor: str,
         mode: Literal["max", "min"],
         deferred: Deferred,
-        training: dict[str, Any] | None = None,
+        training: Mapping[str, Any] | None = None,
     ) -> None:
         self._run = run
         self._interval = interval
@@ -51,18 +52,22 @@ class Checkpoints(L.Callback):
         self._monitor = monitor
         self._sign = 1.0 if mode == "max" else -1.0
         self._deferred = deferred
+        self._states: Mapping[str, Any] = training.get("callbacks", {}) if training else {}
         self._best: float | None = training["best"] if training else None
         self._seconds_before: float = training["seconds"] if training else 0.0
         self._start = time.monotonic()
 
     def on_train_start(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         self._start = time.monotonic()
+        for callback in _others(trainer, self):
+            if callback.state_key in self._states:
+                callback.load_state_dict(self._states[callback.state_key])
 
     def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
         assert isinstance(learner, Learner)
         asked = self._deferred.signum is not None
         if (asked or learner.step % self._interval == 0) and not self._validation_due(learner.step):
-            self._save_last(learner)
+            self._save_last(trainer, learner)
             self._deferred.act()
 
     def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
@@ -74,13 +79,13 @@ class Checkpoints(L.Callback):
             checkpoints.save(self._run.best, {**self._content(learner), "training": None})
         share = trainer.callback_metrics.get("val/foreground_share")
         self._run.update(foreground_share=None if share is None else float(share))
-        self._save_last(learner)
+        self._save_last(trainer, learner)
         self._deferred.act()
 
     def on_train_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
         if not self._validation_due(learner.step):
-            self._save_last(learner)
+            self._save_last(trainer, learner)
 
     def _validation_due(self, step: int) -> bool:
         interval = self._validation_interval
@@ -90,24 +95,43 @@ class Checkpoints(L.Callback):
         job = self._run.job
         return {
             "step": learner.step,
-            "weights": {name: value.detach().cpu() for name, value in learner.model.state_dict().items()},
+            "inference": checkpoints.inference_part(job.config, learner.update.model, learner.step),
             "config": job.raw,
             "choices": job.choices,
         }
 
-    def _save_last(self, learner: Learner) -> None:
-        learner.fetch()  # weights that are not finite are never stored
-        optimizer = learner.optimizers()
-        assert not isinstance(optimizer, list)
+    def _save_last(self, trainer: L.Trainer, learner: Learner) -> None:
+        learner.check_finite()  # weights that are not finite are never stored
         seconds = self._seconds_before + time.monotonic() - self._start
         training = {
-            "optimizer": optimizer.state_dict(),
+            "optimizer": learner.raw_optimizer().state_dict(),
+            "callbacks": {c.state_key: state for c in _others(trainer, self) if (state := c.state_dict())},
             "best": self._best,
             "seconds": seconds,
             "data_fingerprint": self._run.record["data_fingerprint"],
         }
         checkpoints.save(self._run.last, {**self._content(learner), "training": training}, keep_previous=True)
-        self._run.update(steps=learner.step, seconds=round(seconds, 1))
+        self._run.beat(steps=learner.step, seconds=round(seconds, 1))
+
+
+class LastValidation(L.Callback):
+    """Ends training at the last step in a way that makes Lightning validate once more there.
+
+    Args:
+        max_steps: the last step.
+    """
+
+    def __init__(self, max_steps: int) -> None:
+        self._max_steps = max_steps
+
+    def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
+        assert isinstance(learner, Learner)
+        if learner.step >= self._max_steps:
+            trainer.should_stop = True
+
+
+def _others(trainer: L.Trainer, own: L.Callback) -> list[L.Callback]:
+    return [callback for callback in trainer.callbacks if callback is not own]  # type: ignore[attr-defined]
 
 
 class Progress(L.Callback):
@@ -125,7 +149,7 @@ class Progress(L.Callback):
     def on_train_start(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
         self._first_step = learner.step
-        self._meter = Meter("step", learner.step + trainer.max_steps, learner.step, self._seconds)
+        self._meter = Meter("step", trainer.max_steps, learner.step, self._seconds)
         self._meter.__enter__()
 
     def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:

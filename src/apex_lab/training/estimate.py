@@ -1,4 +1,4 @@
-"""How long training will take on a CPU, told before it starts."""
+"""How long training will take on a CPU, estimated before it starts."""
 
 from __future__ import annotations
 
@@ -8,19 +8,20 @@ import time
 import torch
 
 from apex_lab.base.progress import readable
-from apex_lab.config.schema import Config, build_schedules, build_weights
-from apex_lab.scene import SceneModel, schedule_at
+from apex_lab.config.schema import Config, build_clip_frames, build_schedules, build_weights
+from apex_lab.scene import SceneModel
+from apex_lab.training.update import WeightUpdate, named_parameters, remember_rates
 
 SMALL = 5e9
 """Pixels (of all batches together) up to which nothing is measured: twenty times what scale=cpu has."""
 
 LONG = 3 * 3600.0
-"""Seconds above which a person is told."""
+"""Seconds above which there is a warning."""
 
 
 def warning(config: Config, model: SceneModel) -> str | None:
-    """What to tell a person who starts long training on a CPU; None if it is not long."""
-    if pixels(config) <= SMALL:
+    """A warning for long training on a CPU; None if it is not long, or the data do not say how large videos are."""
+    if "frames" not in config.data or "image_size" not in config.data or pixels(config) <= SMALL:
         return None
     seconds = seconds_on_cpu(config, model)
     if seconds <= LONG:
@@ -33,21 +34,25 @@ def warning(config: Config, model: SceneModel) -> str | None:
 
 def pixels(config: Config) -> int:
     """Pixels that training looks at, each batch counted."""
-    data = config.data
-    return config.trainer.max_steps * data["batch_size"] * data["frames"] * data["image_size"] ** 2
+    return images(config) * config.data["image_size"] ** 2
+
+
+def images(config: Config) -> int:
+    """Frames of all batches together."""
+    frames, steps = build_clip_frames(config), config.trainer.max_steps
+    lengths = [frames(step * steps // 100) or config.data["frames"] for step in range(100)]
+    return round(sum(lengths) / 100 * steps * config.clips.batch_size)
 
 
 def seconds_on_cpu(config: Config, model: SceneModel) -> float:
-    """Duration of one step on one video of two frames, scaled up to all steps; the model is left as it was."""
-    frames, side = min(2, config.data["frames"]), config.data["image_size"]
-    schedule = schedule_at({name: value(0) for name, value in build_schedules(config).items()})
-    weights = {name: value(0) for name, value in build_weights(config).items()}
-    model = copy.deepcopy(model).train()
+    """Duration of one step on one clip of at most two frames, scaled up to all frames; the model is left as it was."""
+    frames = min(2, build_clip_frames(config)(0) or config.data["frames"])
+    update = WeightUpdate(copy.deepcopy(model).train(), build_schedules(config), build_weights(config))
+    optimizer = remember_rates(torch.optim.SGD(named_parameters(update.model), lr=0.0))
     with torch.random.fork_rng(devices=[]):
-        video = torch.rand(1, frames, 3, side, side)
+        video = torch.randint(0, 256, (1, frames, 3, *2 * (config.data["image_size"],)), dtype=torch.uint8)
         for _ in range(2):  # the first step also pays for what is set up once
             began = time.perf_counter()
-            terms = model(video, schedule).terms
-            torch.stack([terms[name].sum() * weight for name, weight in weights.items()]).sum().backward()
+            update(video, optimizer)
             seconds = time.perf_counter() - began
-    return seconds / frames * config.data["frames"] * config.data["batch_size"] * config.trainer.max_steps
+    return seconds / frames * images(config)

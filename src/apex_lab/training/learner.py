@@ -1,182 +1,173 @@
 """The one LightningModule: trains and validates any `SceneModel`.
 
-Everything that depends on progress depends on `Learner.step`, the number of weight updates made: schedules, the order
-of the data, and the noise, whose generator is seeded anew for every step. So a run that was stopped after any step goes
-on exactly as if it had not been.
+Everything that depends on progress depends on the number of weight updates made (`WeightUpdate.step`): schedules, the
+order of the data, and the noise, whose generator is seeded again for every step. So a run that was stopped after any
+step resumes exactly as if it had not been.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import lightning as L
 import torch
-from jaxtyping import Float, Int, UInt8
-from torch import Tensor, nn
+import torch.distributed as dist
+from torch import nn
 from torch.optim import Optimizer
 
 from apex_lab.base.errors import UserError
-from apex_lab.metrics import SceneMetrics, scene_identities
-from apex_lab.metrics.scenes import background_identities
-from apex_lab.scene import Scene, SceneModel, Schedule
-from apex_lab.training.schedules import Constant
+from apex_lab.config.schema import VALIDATION_SCORES
+from apex_lab.data.video_set import VideoSet
+from apex_lab.evaluation.score import Tally, add_batch, video_set
+from apex_lab.evaluation.scoring import ScoringPart
+from apex_lab.inference.predictor import Batch, Predictor
+from apex_lab.training.update import WeightUpdate, named_parameters, remember_rates
 
-Batch = Mapping[str, Any]
-"""`video` uint8 (B, T, 3, H, W), `segmentation` uint8 (B, T, H, W), `index` int (B,)."""
 
-Values = Mapping[str, Callable[[int], float]]
-"""Name -> schedule."""
-
-UNSCALED = Constant(1.0)
+class Diverged(UserError):
+    """Loss or gradient is not finite."""
 
 
 class Learner(L.LightningModule):
-    """Optimises the weighted sum of a model's loss terms and logs each of them by name.
+    """Makes weight updates, logs each loss term by name, and validates by the evaluation's scoring path.
 
     Args:
-        model: what is trained.
-        optimizer: weights -> optimiser over them.
-        schedules: the values that the model's forward takes.
-        weights: loss term -> its weight.
-        lr_scale: what all of the optimiser's learning rates are multiplied by.
-        seed: of the noise.
-        gradient_clip_norm: gradients are scaled down to this norm; None leaves them.
+        update: what is done in a step.
+        optimizer: named parameters -> optimiser over them.
         log_interval: steps between two logged steps.
-        step: weight updates already made.
+        rank, ranks: which process this is, of how many.
     """
 
     def __init__(
         self,
-        model: SceneModel,
-        optimizer: Callable[[list[nn.Parameter]], Optimizer],
-        schedules: Values,
-        weights: Values,
-        seed: int = 0,
-        gradient_clip_norm: float | None = None,
+        update: WeightUpdate,
+        optimizer: Callable[[list[tuple[str, nn.Parameter]]], Optimizer],
         log_interval: int = 1,
-        step: int = 0,
-        lr_scale: Callable[[int], float] = UNSCALED,
+        rank: int = 0,
+        ranks: int = 1,
     ) -> None:
         super().__init__()
-        self.model = model
-        self.step = step
-        self.seed = seed
-        self.latest: dict[str, Tensor] = {}
+        self.automatic_optimization = False
+        self.update = update
         self.logged_loss = math.nan
-        self._optimizer = optimizer
-        self._schedules = schedules
-        self._weights = weights
-        self._clip_norm = gradient_clip_norm
-        self._log_interval = log_interval
-        self._lr_scale = lr_scale
-        self._validation = SceneMetrics()
-        self._validation_sums: dict[str, Tensor] = {}
-        self._validation_videos = 0
+        self._optimizer, self._log_interval = optimizer, log_interval
+        self._rank, self._ranks = rank, ranks
+        self._scoring = ScoringPart()
+        self._tally: Tally | None = None
         self._clock, self._frames = 0.0, 0
 
+    @property
+    def step(self) -> int:
+        """Weight updates made."""
+        return self.update.step
+
     def configure_optimizers(self) -> Optimizer:
-        optimizer = self._optimizer([p for p in self.model.parameters() if p.requires_grad])
-        for group in optimizer.param_groups:
-            group.setdefault("initial_lr", group["lr"])  # the name that PyTorch's schedulers store it under, too
-        return optimizer
-
-    def schedule(self) -> Schedule:
-        """The scheduled values at this step; filled on the device, so that nothing waits for a copy."""
-        return {name: torch.full((), value(self.step), device=self.device) for name, value in self._schedules.items()}
-
-    def loss(self, terms: Mapping[str, Float[Tensor, " B"]]) -> Float[Tensor, ""]:
-        """The batch's mean of the weighted sum of terms.
-
-        Raises:
-            UserError: the model gives other terms than those that the configuration weighs.
-        """
-        if terms.keys() != self._weights.keys():
-            raise UserError(f"The model gives the loss terms {sorted(terms)}, loss has {sorted(self._weights)}.")
-        # a weight of 0 takes a term out, even where it is not finite
-        parts = [terms[name].mean() * w for name, weight in self._weights.items() if (w := weight(self.step)) != 0]
-        return torch.stack(parts).sum()
+        return remember_rates(self._optimizer(named_parameters(self.update.model)), self.update.mode == "cuda graph")
 
     def on_train_start(self) -> None:
-        self._clock, self._frames = time.perf_counter(), 0
+        self._restart_clock()
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        torch.manual_seed(noise_seed(self.seed, self.step))
-        scene: Scene = self.model(as_float(batch["video"]), self.schedule())
-        loss = self.loss(scene.terms)
-        self.latest = {
-            "train/loss": loss.detach(),
-            **{f"train/{name}": term.detach().mean() for name, term in scene.terms.items()},
-            **{f"diagnostics/{name}": value.detach() for name, value in scene.diagnostics.items()},
-        }
-        self._frames += batch["video"].shape[0] * batch["video"].shape[1]
-        return loss
+    def forward(self, *args: Any, **kwargs: Any) -> Any:
+        """The model itself."""
+        return self.update.model(*args, **kwargs)
 
-    def configure_gradient_clipping(self, optimizer: Optimizer, *_: Any, **__: Any) -> None:
-        limit = math.inf if self._clip_norm is None else self._clip_norm
-        self.latest["train/gradient_norm"] = nn.utils.clip_grad_norm_(self.model.parameters(), limit).detach()
-
-    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+    def training_step(self, batch: Batch, batch_idx: int) -> None:
         """One weight update and, every `log_interval` updates, its row in the curves."""
+        optimizer = self.optimizers()
+        assert not isinstance(optimizer, list)
+        raw = self.raw_optimizer()
+        step = self.step
+        self.update(batch["video"], raw, self._rank, self._ranks, self.manual_backward, optimizer.step)
+        self._frames += batch["video"].shape[0] * batch["video"].shape[1] * self._ranks
+        if self.step % self._log_interval == 0 or self.step == 1:
+            self._log(step, raw.param_groups[0]["lr"])
+
+    def raw_optimizer(self) -> Optimizer:
+        """PyTorch's optimiser, without Lightning's wrapper."""
         optimizer = self.optimizers(use_pl_optimizer=False)
         assert isinstance(optimizer, Optimizer)
-        for group in optimizer.param_groups:
-            group["lr"] = group["initial_lr"] * self._lr_scale(self.step)
-        super().optimizer_step(*args, **kwargs)
-        values = {name: value(self.step) for name, value in self._schedules.items()}
-        values["lr"] = optimizer.param_groups[0]["lr"]
-        self.step += 1
-        if self.step % self._log_interval == 0 or self.step == 1:
-            row = self.fetch()
-            self.logged_loss = row["train/loss"]
-            row.update({f"schedule/{name}": value for name, value in values.items()})
-            now = time.perf_counter()
-            row["train/frames_per_second"] = self._frames / max(now - self._clock, 1e-9)
-            self._clock, self._frames = now, 0
-            self._record(row)
+        return optimizer
+
+    def _log(self, step: int, rate: Any) -> None:
+        row = self.fetch()
+        self.logged_loss = row["train/loss"]
+        schedules = self.update.schedules.schedules
+        row.update({f"schedule/{name}": float(schedule(step)) for name, schedule in schedules.items()})
+        row["schedule/lr"] = float(rate)
+        row["train/frames_per_second"] = self._frames / max(time.perf_counter() - self._clock, 1e-9)
+        self._restart_clock()
+        self._record(row)
 
     def fetch(self) -> dict[str, float]:
-        """The latest step's values as numbers, in one copy from the device.
+        """The latest step's values as numbers, averaged over ranks (so all must call), in one copy from the device.
 
         Raises:
-            UserError: loss or gradient norm is not finite.
+            Diverged: loss or gradient norm is not finite.
         """
-        names = list(self.latest)
-        values = torch.stack([self.latest[name].float() for name in names]).tolist()
-        row = dict(zip(names, values, strict=True))
+        names = list(self.update.latest)
+        stacked = torch.stack([self.update.latest[name].float() for name in names])
+        if self._ranks > 1:
+            dist.all_reduce(stacked)
+            stacked /= self._ranks
+        row = dict(zip(names, stacked.tolist(), strict=True))
+        self.check_finite(row)
+        return row
+
+    def check_finite(self, row: Mapping[str, float] | None = None) -> None:
+        """Looks at values of the latest step, by default at this rank's own.
+
+        Raises:
+            Diverged: loss or gradient norm is not finite.
+        """
+        row = {name: float(value) for name, value in self.update.latest.items()} if row is None else row
         for name in ("train/loss", "train/gradient_norm"):
             if not math.isfinite(row.get(name, 0.0)):
-                broken = [n for n in names if not math.isfinite(row[n])]
-                raise UserError(
+                broken = [n for n, value in row.items() if not math.isfinite(value)]
+                raise Diverged(
                     f"{name} is {row[name]} at step {self.step} (not finite: {', '.join(broken)}): "
                     "try a lower optimizer.lr, a lower trainer.gradient_clip_norm or another seed."
                 )
-        return row
 
     def on_validation_epoch_start(self) -> None:
-        self._validation.reset()
-        self._validation_sums, self._validation_videos = {}, 0
+        self.update.write()
+        model = self.update.model
+        self._tally = Tally.empty(self._scoring.settings(model.tracks))
+        self._predictor = Predictor(
+            model, self.update.schedules.tensors(), self.device, self.update.precision, seed=self.update.seed
+        )
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        video, truth = as_float(batch["video"]), batch["segmentation"].long()
-        scene = self.model(video, self.schedule())
-        identities = scene_identities(scene, truth.shape[-2:])
-        self._validation.update(identities, truth)
-        values = {"loss": self.loss(scene.terms).expand(len(video)), **scene.terms}
-        if bool(scene.background.any()):
-            values["foreground_share"] = foreground_share(scene, identities)
-        for name, value in values.items():
-            self._validation_sums[name] = self._validation_sums.get(name, torch.zeros_like(value[0])) + value.sum()
-        self._validation_videos += len(video)
+        assert self._tally is not None
+        add_batch(self._tally, self._predictor, batch, self._videos(), self._scoring)
 
     def on_validation_epoch_end(self) -> None:
-        row = {f"val/{name}": float(value) / self._validation_videos for name, value in self._validation_sums.items()}
-        row.update({f"val/{name}": float(value) for name, value in self._validation.compute().items()})
+        assert self._tally is not None
+        tally = _gathered(self._tally, self._ranks)
+        self._tally = None
+        terms = tally.mean_terms()
+        row = {f"val/{name}": value for name, value in terms.items()}
+        tensors = {name: torch.tensor([value], device=self.device) for name, value in terms.items()}
+        row["val/loss"] = float(self.update.objective(tensors)) if terms else math.nan
+        share = tally.mean_share()
+        if share is not None:
+            row["val/foreground_share"] = share
+        if tally.evaluator.records:
+            total = tally.evaluator.result()["total"]
+            row.update({f"val/{k}": total[k] for k in VALIDATION_SCORES if not math.isnan(total.get(k, math.nan))})
         for name, value in row.items():
-            self.log(name, value, logger=False)
+            self.log(name, value, logger=False, rank_zero_only=False)
         self._record(row)
+        self._restart_clock()
+
+    def _videos(self) -> VideoSet:
+        loader = self.trainer.val_dataloaders
+        assert loader is not None
+        return video_set(loader)
+
+    def _restart_clock(self) -> None:
         self._clock, self._frames = time.perf_counter(), 0
 
     def _record(self, row: dict[str, float]) -> None:
@@ -184,57 +175,14 @@ class Learner(L.LightningModule):
             logger.log_metrics(row, step=self.step)
 
 
-class Stretches(Iterable[Batch]):
-    """Cuts one endless-looking pass over batches into stretches that end where validation is due.
-
-    Lightning takes each stretch for an epoch and validates at its end. A run that goes on from a step in the middle of
-    a stretch begins with a shorter one, so validations stay at the same steps.
-
-    Args:
-        batches: all batches from the learner's step on.
-        learner: whose step is read.
-        interval: steps between validations; None is one single stretch.
-    """
-
-    def __init__(self, batches: Iterable[Batch], learner: Learner, interval: int | None) -> None:
-        self._batches = batches
-        self._iterator: Iterator[Batch] | None = None
-        self._learner = learner
-        self._interval = interval
-
-    def __iter__(self) -> Iterator[Batch]:
-        if self._iterator is None:
-            self._iterator = iter(self._batches)
-        # counted here, not read from the learner at every batch, because the loop fetches one batch ahead
-        step = self._learner.step
-        while True:
-            batch = next(self._iterator, None)
-            if batch is None:
-                return
-            yield batch
-            step += 1
-            if self._interval is not None and step % self._interval == 0:
-                return
-
-
-def as_float(video: UInt8[Tensor, "B T 3 H W"]) -> Float[Tensor, "B T 3 H W"]:
-    """RGB in [0, 1] from bytes, on the device where the bytes are."""
-    return video.float() / 255.0
-
-
-def foreground_share(scene: Scene, identities: Int[Tensor, "B T H W"]) -> Float[Tensor, " B"]:
-    """Share of a video's pixels that the model gives to objects, not to its background."""
-    backgrounds = background_identities(scene)
-    given = [
-        torch.isin(video, video.new_tensor(sorted(ids))) for video, ids in zip(identities, backgrounds, strict=True)
-    ]
-    return torch.stack([1.0 - background.float().mean() for background in given])
-
-
-def noise_seed(seed: int, step: int) -> int:
-    """A generator seed for one step of one run; neighbouring seeds and steps give unrelated numbers (splitmix64)."""
-    mask = 2**64 - 1
-    value = (seed * 0x9E3779B97F4A7C15 + step + 1) & mask
-    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-        value = ((value ^ (value >> shift)) * factor) & mask
-    return (value ^ (value >> 31)) & (2**63 - 1)
+def _gathered(tally: Tally, ranks: int) -> Tally:
+    """The scores of all ranks' videos, on every rank."""
+    if ranks == 1:
+        return tally
+    found: list[Tally | None] = [None] * ranks
+    dist.all_gather_object(found, tally)
+    whole = Tally.empty(tally.evaluator.settings)
+    for each in found:
+        assert each is not None
+        whole.merge(each)
+    return whole

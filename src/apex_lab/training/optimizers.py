@@ -66,6 +66,10 @@ def is_matrix(weight: Tensor) -> bool:
     return weight.dim() in (2, 4) and min(weight.shape[0], weight[0].numel()) > 1
 
 
+def _is_matrix(weight: nn.Parameter | tuple[str, nn.Parameter]) -> bool:
+    return is_matrix(weight[1] if isinstance(weight, tuple) else weight)
+
+
 class Muon(Optimizer):
     """Momentum, orthogonalised per weight matrix (Jordan et al. 2024); Adam for biases, gains and bias images.
 
@@ -74,7 +78,7 @@ class Muon(Optimizer):
     ones too.
 
     Args:
-        params: the weights.
+        params: the weights, with or without their names.
         lr: of the matrices.
         momentum: of the matrices.
         adam_lr: of everything else.
@@ -85,7 +89,7 @@ class Muon(Optimizer):
 
     def __init__(
         self,
-        params: Iterable[nn.Parameter],
+        params: Iterable[nn.Parameter] | Iterable[tuple[str, nn.Parameter]],
         lr: Positive = 0.01,
         momentum: Decay = 0.95,
         adam_lr: Positive = 1e-3,
@@ -94,8 +98,8 @@ class Muon(Optimizer):
         eps: Positive = 1e-8,
         iterations: Annotated[int, Field(ge=1, le=6)] = 5,
     ) -> None:
-        weights = list(params)
-        matrices, others = [w for w in weights if is_matrix(w)], [w for w in weights if not is_matrix(w)]
+        weights: list[Any] = list(params)
+        matrices, others = [w for w in weights if _is_matrix(w)], [w for w in weights if not _is_matrix(w)]
         groups: list[dict[str, Any]] = []
         if matrices:
             groups.append({"params": matrices, "matrices": True, "lr": lr})

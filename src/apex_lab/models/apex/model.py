@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
+from torch.profiler import record_function
 
 from apex_lab.models.apex.background import Background
 from apex_lab.models.apex.encoder import ApexEncoder
@@ -155,16 +156,22 @@ class Apex(SceneModel):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
         before: State | None = context.state
         noise = context.noise if self.training else None
-        features, encoder = self.encoder(video, None if before is None else before.encoder)
+        with record_function("encoder"):
+            features, encoder = self.encoder(video, None if before is None else before.encoder)
         look_at, follow_in = self.glimpses.sources(video, features, None if before is None else before.frame)
-        proposals = self.discovery(features, look_at, self.glimpses, self.appearance, noise)
+        with record_function("discovery"):
+            proposals = self.discovery(features, look_at, self.glimpses, self.appearance, noise)
         memory = (
             Memory.empty(len(video), self.max_objects, proposals.what.shape[-1], self.hidden, proposals.what)
             if before is None
             else before.memory
         )
-        steps, memory = self._roll_out(look_at, follow_in, proposals, memory, context.schedule, noise)
-        return self._explain(video, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z))
+        with record_function("loop over time"):
+            steps, memory = self._roll_out(look_at, follow_in, proposals, memory, context.schedule, noise)
+        with record_function("rendering"):
+            return self._explain(
+                video, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z)
+            )
 
     def posterior(
         self, scene: Scene, video: Float[Tensor, "B T 3 H W"], context: Context
@@ -209,21 +216,23 @@ class Apex(SceneModel):
         frames = frames_of(look_at, follow_in, proposals, self._alpha(proposals.what))
         steps = []
         for frame in frames:
-            before, beliefs = self.propagation(
-                state,
-                self.glimpses,
-                self.appearance,
-                frame.look_at,
-                frame.follow_in,
-                valid,
-                schedule["temperature"],
-                noise,
-            )
+            with record_function("propagation"):
+                before, beliefs = self.propagation(
+                    state,
+                    self.glimpses,
+                    self.appearance,
+                    frame.look_at,
+                    frame.follow_in,
+                    valid,
+                    schedule["temperature"],
+                    noise,
+                )
             alpha = self._alpha(before.what)
             scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
 
             open_ = self._may_discover(carried_on, schedule, noise).to(scope.dtype)
-            context, unexplained = self._context(frame, scope)
+            with record_function("discovery"):
+                context, unexplained = self._context(frame, scope)
             prob = frame.prob * context * open_  # Eq. 17
             # Eq. 6: the prior of a discovery's presence, given the propagated objects
             prior = schedule["discovery_presence"] * unexplained * open_
@@ -361,15 +370,16 @@ class Apex(SceneModel):
         """Appearance, likelihood and mask entropy of N frames whose masks are known."""
         colours = torch.sigmoid(self.colour_decoder(part.what.flatten(0, 1))).unflatten(0, part.presence.shape)
         means = paster.each(colours)  # (N, R, 3, H, W)
-        log_likelihood = self.likelihood(
-            image,
-            masks.log_objects,
-            means,
-            masks.log_background,
-            backdrop,
-            context.schedule["sigma_fg_scale"],
-            context.schedule["sigma_bg_scale"],
-        )
+        with record_function("likelihood"):
+            log_likelihood = self.likelihood(
+                image,
+                masks.log_objects,
+                means,
+                masks.log_background,
+                backdrop,
+                context.schedule["sigma_fg_scale"],
+                context.schedule["sigma_bg_scale"],
+            )
         return Picture(
             masks.objects,
             masks.foreground,

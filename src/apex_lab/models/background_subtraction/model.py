@@ -12,7 +12,7 @@ from pydantic import Field
 from torch import Tensor
 
 from apex_lab.models.regions import scene_of_regions
-from apex_lab.scene import Context, Scene, SceneModel
+from apex_lab.scene import Context, Scene, SceneModel, Statistics
 
 
 class BackgroundSubtraction(SceneModel):
@@ -57,14 +57,16 @@ class BackgroundSubtraction(SceneModel):
         self.radius = radius
         self.min_area = min_area
         self.max_objects = max_objects
+        self.input_size = (image_size, image_size)
         self.register_buffer("median", torch.full((3, image_size, image_size), float("nan")))
 
-    def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
+    def initialise(self, statistics: Statistics) -> None:
         """Takes the training set's per-pixel median, RGB in [0, 1].
 
         Raises:
             ValueError: the picture has another size than `image_size`.
         """
+        median = statistics.median
         if median.shape != self.median.shape:
             raise ValueError(
                 f"median has the shape {tuple(median.shape)}, expected {tuple(self.median.shape)}: "
@@ -85,7 +87,7 @@ class BackgroundSubtraction(SceneModel):
                 f"set model.image_size={video.shape[-1]}"
             )
         if self.median.isnan().any():
-            raise ValueError("BackgroundSubtraction has no median picture yet: call initialise(median) first")
+            raise ValueError("BackgroundSubtraction has no median picture yet: call initialise(statistics) first")
         median = self.median.to(video)
         # the shade a · median nearest to a colour x: a = <x, median> / <median, median>, held within its limits
         shade = (video * median).sum(dim=2) / median.square().sum(dim=0).clamp(min=1e-6)
@@ -94,7 +96,11 @@ class BackgroundSubtraction(SceneModel):
         frames = foreground.flatten(0, 1).cpu().numpy().astype(np.uint8)
         labels = torch.from_numpy(np.stack([self._components(frame) for frame in frames]))
         return scene_of_regions(
-            video, labels.unflatten(0, video.shape[:2]).to(video.device), self.max_objects + 1, background=median
+            video,
+            labels.unflatten(0, video.shape[:2]).to(video.device),
+            self.max_objects + 1,
+            background=median,
+            state=context.state,
         )
 
     def _components(self, foreground: np.ndarray) -> Int[np.ndarray, "H W"]:

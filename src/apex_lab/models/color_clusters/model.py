@@ -59,6 +59,7 @@ class ColorClusters(SceneModel):
     """
 
     needs_training = False
+    streams = False  # the colours of a whole video are clustered at once
 
     def __init__(
         self,

@@ -10,7 +10,7 @@ The same parts, weights, equations and loss terms, and as wide. What differs is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -18,19 +18,21 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from apex_lab.benchmark.grid import GridPaster, grid_crop
+from apex_lab.config import components
+from apex_lab.inference.predictor import joined
 from apex_lab.models.apex.likelihood import MixtureLikelihood, log_normal
 from apex_lab.models.apex.masks import ApexNormalisation, Masks
-from apex_lab.models.apex.model import FIRST_ID, Apex
+from apex_lab.models.apex.model import Apex
 from apex_lab.models.apex.objective import kl_terms
 from apex_lab.models.apex.objects import Objects, Proposals, context_probability, sample_presence, scope_in_windows
 from apex_lab.models.apex.result import Drawn, scene_of, video_of
-from apex_lab.models.apex.rollout import Step, frames_of, stack_steps
+from apex_lab.models.apex.rollout import Memory, Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import Carried, carry, gather_slots
 from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian, kl_gaussian
 from apex_lab.nn.spatial_transformer import Paster
-from apex_lab.scene import ABSENT, Scene, Schedule
+from apex_lab.scene import Context, Noise, Scene, Schedule
+from tests.reference.grid import GridPaster, grid_crop
 
 
 class PlainMixture(MixtureLikelihood):
@@ -71,12 +73,9 @@ class _Memory:
     """What a frame hands to the next one."""
 
     def __init__(self, model: Apex, frame: Tensor) -> None:
-        b, slots, side = len(frame), model.max_objects, frame.shape[-1] // model.encoder.stride
-        self.objects = Objects.empty(b, slots, model.appearance.what, model.hidden, frame)
-        self.valid = torch.zeros(b, slots, dtype=torch.bool, device=frame.device)
-        self.ids = torch.full((b, slots), ABSENT, device=frame.device)
-        self.next_id = torch.full((b,), FIRST_ID, device=frame.device)
-        self.carried_on = torch.zeros(b, 1, dtype=torch.bool, device=frame.device)
+        b, side = len(frame), frame.shape[-1] // model.encoder.stride
+        loop = Memory.empty(b, model.max_objects, model.appearance.what, model.hidden, frame)
+        self.objects, self.valid, self.ids, self.next_id, self.carried_on = loop
         self.hidden = self.cell = frame.new_zeros(b, model.encoder.features, side, side)
         self.features: Tensor | None = None
         self.z_background: Tensor | None = None
@@ -97,17 +96,18 @@ class Straightforward(Apex):
     def _paster(self, place: Float[Tensor, "*batch 4"], glimpse: int) -> GridPaster:
         return GridPaster(window_of(place), glimpse, self.image_size)
 
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
-        """As `Apex.forward`, frame by frame."""
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
+        """As `Apex.forward` of a whole video, frame by frame."""
         memory = _Memory(self, video[:, 0])
-        return _joined([self._frame(video, i, memory, schedule) for i in range(video.shape[1])])
+        return joined([self._frame(video, i, memory, context) for i in range(video.shape[1])])
 
-    def _frame(self, video: Tensor, i: int, memory: _Memory, schedule: Schedule) -> Scene:
+    def _frame(self, video: Tensor, i: int, memory: _Memory, context: Context) -> Scene:
         """Explains one frame and updates the memory."""
+        noise = context.noise if self.training else None
         look_at, follow_in, features = self._sources(video, i, memory)
-        proposals = self.discovery(features, look_at[:, None], self.glimpses, self.appearance, self.training)
-        step = self._infer(look_at, follow_in, proposals, memory, schedule)
-        return self._render(video[:, i : i + 1], proposals, step, memory, schedule)
+        proposals = self.discovery(features, look_at[:, None], self.glimpses, self.appearance, noise)
+        step = self._infer(look_at, follow_in, proposals, memory, context.schedule, noise)
+        return self._render(video[:, i : i + 1], proposals, step, memory, context, noise)
 
     def _sources(self, video: Tensor, i: int, memory: _Memory) -> tuple[Tensor, Tensor, Tensor]:
         """What is looked at in this frame and what is followed, (B, C, h, w), and its features (B, 1, F, h, w)."""
@@ -122,7 +122,13 @@ class Straightforward(Apex):
         return look_at[:, -1], follow_in[:, -1], features
 
     def _infer(
-        self, look_at: Tensor, follow_in: Tensor, proposals: Proposals, memory: _Memory, schedule: Schedule
+        self,
+        look_at: Tensor,
+        follow_in: Tensor,
+        proposals: Proposals,
+        memory: _Memory,
+        schedule: Schedule,
+        noise: Noise | None,
     ) -> Step:
         """Propagation, presence of discoveries, filtering: the body of the loop in `Apex._roll_out`."""
         temperature = schedule["temperature"]
@@ -134,7 +140,7 @@ class Straightforward(Apex):
             follow_in,
             memory.valid,
             temperature,
-            self.training,
+            noise,
         )
         alpha, alphas = self._alpha(before.what), self._alpha(proposals.what[:, 0])
         scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
@@ -142,16 +148,16 @@ class Straightforward(Apex):
         claims = self.masks.claim(alphas, paster)
         [cells] = frames_of(look_at[:, None], follow_in[:, None], proposals, alphas[:, None])
 
-        open_ = self._may_discover(memory.carried_on, schedule).to(scope.dtype)
+        open_ = self._may_discover(memory.carried_on, schedule, noise).to(scope.dtype)
         prob = cells.prob * context_probability(scope, claims) * open_
         prior = schedule["discovery_presence"] * scope_in_windows(scope, *paster.inside()) * open_
-        pres = sample_presence(prob, temperature, self.training) * open_
+        pres = sample_presence(prob, temperature, noise) * open_
         top = prob.detach().topk(self.render_top, dim=1).indices
         candidates = Objects.join(before, self._found(cells, pres, top))
         exists = torch.cat([memory.valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
         kept = carry(candidates.presence, exists, memory.ids, memory.next_id, self.keep_threshold)
         alive = memory.valid
-        self._remember(memory, candidates, kept, schedule)
+        self._remember(memory, candidates, kept, schedule, noise)
         return Step(
             candidates.what,
             candidates.place,
@@ -168,10 +174,12 @@ class Straightforward(Apex):
             kept.ids,
         )
 
-    def _remember(self, memory: _Memory, candidates: Objects, kept: Carried, schedule: Schedule) -> None:
+    def _remember(
+        self, memory: _Memory, candidates: Objects, kept: Carried, schedule: Schedule, noise: Noise | None
+    ) -> None:
         memory.objects = candidates.gather(kept.source)
         memory.ids, memory.next_id = kept.ids, kept.next_id
-        memory.carried_on = self._carried_on(len(kept.ids), schedule)
+        memory.carried_on = self._carried_on(memory.carried_on, schedule, noise)
         memory.valid = kept.valid & memory.carried_on
 
     def _render(
@@ -180,7 +188,8 @@ class Straightforward(Apex):
         proposals: Proposals,
         step: Step,
         memory: _Memory,
-        schedule: Schedule,
+        context: Context,
+        noise: Noise | None,
     ) -> Scene:
         """Rendering, likelihood, KL and the result of one frame."""
         steps = stack_steps([step])
@@ -189,9 +198,9 @@ class Straightforward(Apex):
         )
         paster = self._paster(place, alpha.shape[-1])
         masks = self.masks.compose(alpha, presence, valid, paster)
-        backdrop, kl_background = self._backdrop(frame[:, 0], masks, memory)
+        backdrop, kl_background = self._backdrop(frame[:, 0], masks, memory, noise)
         picture = self._picture(
-            frame[:, 0], Drawn(alpha, presence, valid, place, what), paster, masks, backdrop, schedule
+            frame[:, 0], Drawn(alpha, presence, valid, place, what), paster, masks, backdrop, context
         )
         slots = self.max_objects
         terms = {
@@ -210,34 +219,29 @@ class Straightforward(Apex):
             "kl_background": kl_background,
             "mask_entropy": picture.mask_entropy,
         }
-        return scene_of(steps, video_of([picture], len(frame)), terms)
+        return scene_of(steps, video_of([picture], len(frame)), terms, context.detail)
 
-    def _backdrop(self, frame: Tensor, masks: Masks, memory: _Memory) -> tuple[Tensor, Tensor]:
+    def _backdrop(self, frame: Tensor, masks: Masks, memory: _Memory, noise: Noise | None) -> tuple[Tensor, Tensor]:
         """The background's picture (B, 3, H, W) and what its latent costs (B,)."""
         q = self.background.posterior(masks.background, frame)
-        z = q.sample(self.training)
+        z = q.sample(noise)
         history = [z] if memory.z_background is None else [memory.z_background, z]
         p = self.background.prior(torch.stack(history, dim=1))
         memory.z_background = z
         return self.background.decode(z), kl_gaussian(q, Gaussian(p.mean[:, -1], p.std[:, -1]))
 
 
-def _joined(frames: Sequence[Scene]) -> Scene:
-    """Scenes of one frame each -> the scene of the video; terms are summed over frames, diagnostics averaged."""
+def twins(model: Apex, node: Mapping[str, Any]) -> dict[str, Straightforward]:
+    """What the benchmark compares with: as wide and with the same weights; one renders all cells of discovery.
 
-    def over_time(name: str) -> Any:
-        values = [getattr(frame, name) for frame in frames]
-        return None if values[0] is None else torch.cat(values, dim=1)
-
-    first = frames[0]
-    return Scene(
-        background=first.background,
-        terms={name: torch.stack([frame.terms[name] for frame in frames]).sum(0) for name in first.terms},
-        diagnostics={
-            name: torch.stack([frame.diagnostics[name] for frame in frames]).mean(0) for name in first.diagnostics
-        },
-        **{
-            name: over_time(name)
-            for name in ("masks", "ids", "presence", "appearance", "reconstruction", "windows", "means")
-        },
-    )
+    Args:
+        model: whose weights are taken.
+        node: the configuration that it was built from.
+    """
+    found = {}
+    for name, top in (("straightforward", None), ("straightforward, renders as many", model.render_top)):
+        own = {**node, "_target_": f"{Straightforward.__module__}.{Straightforward.__name__}", "render_top": top}
+        twin = components.build(own, "model")
+        twin.load_state_dict(model.state_dict())
+        found[name] = twin
+    return found

@@ -6,9 +6,9 @@ import copy
 
 import pytest
 import torch
-
 from apex_lab.benchmark.grid import GridPaster, grid_crop
 from apex_lab.benchmark.straightforward import Straightforward
+
 from apex_lab.config.schema import build_model, build_schedules
 from apex_lab.models.apex import Apex
 from apex_lab.nn.spatial_transformer import Paster, crop

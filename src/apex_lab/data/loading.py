@@ -1,0 +1,59 @@
+"""Loaders: training clips step by step, and whole videos in order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch.utils.data import DataLoader, Subset
+
+from apex_lab.data.clips import ClipSampler, Frames, whole_videos
+from apex_lab.data.source import VideoSource
+from apex_lab.data.video_set import Item, VideoSet
+
+Loader = DataLoader[Item]
+
+
+def training_loader(
+    source: VideoSource,
+    batch_size: int,
+    seed: int,
+    start: int,
+    stop: int,
+    frames: Frames = whole_videos,
+    rank: int = 0,
+    ranks: int = 1,
+) -> Loader:
+    """One batch of training clips for each step from `start` up to `stop`; arguments as in `ClipSampler`."""
+    videos = source.sets["train"]
+    lengths = [videos.length(i) for i in range(len(videos))]
+    batches = ClipSampler(lengths, batch_size, seed, start, stop, frames, videos.views, rank, ranks)
+    return DataLoader(videos, batch_sampler=batches, **_options(source.workers))
+
+
+def whole_loader(
+    videos: VideoSet, batch_size: int, count: int | None = None, workers: int = 0, rank: int = 0, ranks: int = 1
+) -> Loader:
+    """The first `count` whole videos of a set (None: all) in order.
+
+    Args:
+        videos: the set.
+        batch_size: videos at a time; videos of different lengths come one at a time.
+        count: how many.
+        workers: processes that load.
+        rank, ranks: each rank gets every `ranks`-th video.
+    """
+    total = len(videos) if count is None else min(count, len(videos))
+    chosen = range(rank, total, ranks)
+    equal = len({videos.length(i) for i in chosen}) <= 1
+    return DataLoader(Subset(videos, chosen), batch_size=batch_size if equal else 1, **_options(workers))
+
+
+def _options(workers: int) -> dict[str, Any]:
+    return {
+        "num_workers": workers,
+        "persistent_workers": workers > 0,
+        "pin_memory": torch.cuda.is_available(),
+        # a generator of its own: starting a loader must not change the random numbers of the training
+        "generator": torch.Generator().manual_seed(0),
+    }

@@ -1,0 +1,42 @@
+"""A data set as the configuration names it: how to get it, and its three splits."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any
+
+from apex_lab.data.video_set import VideoSet
+
+
+class VideoSource(ABC):
+    """Makes or finds the data, then opens them. Building one reads nothing.
+
+    Attributes:
+        sets: the splits by name (train, val, test), after `open`.
+        workers: processes that load training clips; 0 loads in the training process.
+    """
+
+    workers: int = 0
+    sets: Mapping[str, VideoSet]
+
+    @abstractmethod
+    def prepare(self) -> None:
+        """Makes sure that the data are there and are right; the first time that can take minutes.
+
+        Raises:
+            UserError: they are missing and cannot or may not be made, or are damaged.
+        """
+
+    @abstractmethod
+    def open(self) -> None:
+        """Fills `sets`; call after `prepare`."""
+
+    @property
+    @abstractmethod
+    def fingerprint(self) -> str:
+        """32 hex digits that are equal only for equal data; call after `prepare`."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """What a record keeps about the data: at least `name`, `fingerprint` and the settings."""

@@ -1,0 +1,44 @@
+"""Videos to a model's input size, and its output back to the video's."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from apex_lab.metrics.scenes import resize_masks
+from apex_lab.scene import Scene
+
+Size = tuple[int, int]
+
+
+def as_float(video: UInt8[Tensor, "*batch 3 H W"]) -> Float[Tensor, "*batch 3 H W"]:
+    """RGB in [0, 1] from bytes, on the device where the bytes are."""
+    return video.float() / 255.0
+
+
+def fitted(video: Float[Tensor, "B T 3 H W"], size: Size | None) -> Float[Tensor, "B T 3 H2 W2"]:
+    """The video at a model's input size, antialiased; as it is where the sizes agree or any size will do."""
+    if size is None or tuple(video.shape[-2:]) == tuple(size):
+        return video
+    return _resized(video, size)
+
+
+def fitted_back(scene: Scene, size: Size) -> Scene:
+    """A scene at the size of the video: masks, reconstruction and means; masks still sum to 1."""
+    if tuple(scene.masks.shape[-2:]) == tuple(size):
+        return scene
+    return dataclasses.replace(
+        scene,
+        masks=resize_masks(scene.masks, size),
+        reconstruction=_resized(scene.reconstruction, size),
+        means=None if scene.means is None else _resized(scene.means, size),
+    )
+
+
+def _resized(images: Float[Tensor, "*batch 3 H W"], size: Size) -> Float[Tensor, "*batch 3 H2 W2"]:
+    flat = images.float().reshape(-1, *images.shape[-3:])
+    found = F.interpolate(flat, size=size, mode="bilinear", align_corners=False, antialias=True)
+    return found.clamp(0, 1).reshape(*images.shape[:-2], *size)

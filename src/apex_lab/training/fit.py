@@ -1,0 +1,137 @@
+"""All weight updates that are left of a run, on every rank."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+import torch.distributed as dist
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins.environments import LightningEnvironment
+from lightning.pytorch.strategies import DDPStrategy
+
+from apex_lab.config.schema import (
+    Config,
+    build_clip_frames,
+    build_lr_scale,
+    build_optimizer,
+    build_schedules,
+    build_weights,
+)
+from apex_lab.data import VideoSource, training_loader, whole_loader
+from apex_lab.scene import SceneModel
+from apex_lab.training.callbacks import LastValidation
+from apex_lab.training.learner import Learner
+from apex_lab.training.ranks import Ranks
+from apex_lab.training.update import Mode, WeightUpdate
+
+
+def fit(
+    config: Config,
+    model: SceneModel,
+    source: VideoSource,
+    device: torch.device,
+    step: int,
+    training: Mapping[str, Any] | None,
+    ranks: Ranks,
+    callbacks: Sequence[L.Callback] = (),
+    loggers: Sequence[Logger] = (),
+    folder: Path | None = None,
+) -> None:
+    """Trains from a step to the end.
+
+    Args:
+        config: of the run.
+        model: with the weights of that step.
+        source: opened.
+        device: kind of device.
+        step: weight updates made.
+        training: `training` entry of the checkpoint of that step; None at the start.
+        ranks: which process this is.
+        callbacks, loggers: of rank 0.
+        folder: where Lightning may leave files; the run's.
+    """
+    settings = config.trainer
+
+    def optimizer(parameters: list[tuple[str, torch.nn.Parameter]]) -> torch.optim.Optimizer:
+        built = build_optimizer(config, parameters)
+        if training is not None:
+            built.load_state_dict(training["optimizer"])
+        return built
+
+    update = WeightUpdate(
+        model,
+        build_schedules(config),
+        build_weights(config),
+        build_lr_scale(config),
+        settings.gradient_clip_norm,
+        config.seed,
+        settings.precision,
+        step,
+        mode_of(config, device),
+    )
+    learner = Learner(update, optimizer, settings.log_interval, ranks.rank, ranks.world)
+    trainer = L.Trainer(
+        accelerator="gpu" if device.type == "cuda" else "cpu",
+        devices=settings.devices,
+        num_nodes=settings.num_nodes,
+        # a term with weight 0 leaves parameters without gradients
+        strategy=DDPStrategy(find_unused_parameters=True) if ranks.world > 1 else "auto",
+        # Lightning's own precision: validation runs in it too; the step opens the same for itself
+        precision="bf16-mixed" if settings.precision == "bf16-mixed" else "32-true",
+        # nothing but the project's own files decides where a run resumes, also under Slurm
+        plugins=[LightningEnvironment()],
+        max_epochs=1,
+        max_steps=settings.max_steps,
+        val_check_interval=settings.validation_interval,
+        check_val_every_n_epoch=None if settings.validation_interval is not None else 1,
+        limit_val_batches=None if settings.validation_interval is not None else 0,
+        num_sanity_val_steps=0,
+        logger=list(loggers),
+        callbacks=[*callbacks, LastValidation(settings.max_steps)],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        inference_mode=False,
+        default_root_dir=folder,
+    )
+    resume_at(trainer, step)
+    batches = training_loader(
+        source,
+        config.clips.batch_size,
+        config.seed,
+        step,
+        settings.max_steps,
+        build_clip_frames(config),
+        ranks.rank,
+        ranks.world,
+    )
+    validation = whole_loader(
+        source.sets["val"],
+        config.evaluation.batch_size,
+        settings.validation_videos,
+        rank=ranks.rank,
+        ranks=ranks.world,
+    )
+    trainer.fit(learner, batches, validation if settings.validation_interval is not None else None)
+    if ranks.world > 1 and dist.is_initialized():
+        dist.destroy_process_group()
+
+
+def resume_at(trainer: L.Trainer, step: int) -> None:
+    """Sets Lightning's counters of batches and updates, so that its steps and validations are those of the run."""
+    loop = trainer.fit_loop.epoch_loop
+    batches, updates = loop.batch_progress.total, loop.manual_optimization.optim_step_progress.total
+    batches.ready = batches.completed = step
+    updates.ready = updates.completed = step
+
+
+def mode_of(config: Config, device: torch.device) -> Mode:
+    """How weight updates are carried out."""
+    if config.trainer.cuda_graph and device.type == "cuda":
+        return "cuda graph"
+    return "compiled" if config.trainer.compile else "eager"

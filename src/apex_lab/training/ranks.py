@@ -1,0 +1,136 @@
+"""Several processes that train one model: Lightning's DDP, with the run folder in the hands of rank 0.
+
+On one machine rank 0 starts the others itself. Under torchrun or Slurm they are started from outside, and the
+environment gives each its rank. Only rank 0 takes the run's lock and writes files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import replacing
+
+JOB = "APEX_LAB_JOB"
+"""Environment variable of a process that rank 0 has started: the file with the job."""
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """Which process this is, of how many."""
+
+    rank: int = 0
+    world: int = 1
+
+
+def given() -> Ranks | None:
+    """What torchrun, or rank 0 of this package, says in the environment; None where nobody does."""
+    if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
+        return Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
+    return None
+
+
+@contextlib.contextmanager
+def started(job: dict[str, Any], devices: int, nodes: int, folder: Path) -> Iterator[Ranks]:
+    """For rank 0: the other ranks, which end with this block where they were started here.
+
+    Args:
+        job: what `apex_lab.training.worker` needs, plain values.
+        devices: processes on this machine.
+        nodes: machines.
+        folder: the run's, where ranks that a launcher has started find the job.
+
+    Raises:
+        UserError: several nodes without a launcher that says which one this is.
+    """
+    outside = given()
+    if outside is not None:
+        file = job_file(folder)
+        with replacing(file) as opened:
+            torch.save(job, opened)
+        try:
+            yield outside
+        finally:
+            file.unlink(missing_ok=True)
+        return
+    if nodes > 1:
+        raise UserError(
+            f"trainer.num_nodes = {nodes} needs a launcher that starts one process per device, such as torchrun: "
+            "see docs/clusters.md."
+        )
+    if devices == 1:
+        yield Ranks()
+        return
+    common = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(_free_port()), "WORLD_SIZE": str(devices)}
+    threads = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(max(1, torch.get_num_threads() // devices)))}
+    with tempfile.TemporaryDirectory(prefix="apex_lab_ranks_") as aside:
+        file = Path(aside) / "job.pt"
+        torch.save(job, file)
+        workers: list[subprocess.Popen[bytes]] = []
+        before = dict(os.environ)
+        try:
+            for rank in range(1, devices):
+                own = {"RANK": str(rank), "LOCAL_RANK": str(rank), "NODE_RANK": "0", JOB: str(file)}
+                command = [sys.executable, "-m", "apex_lab.training.worker"]
+                workers.append(
+                    subprocess.Popen(command, env={**os.environ, **common, **threads, **own}, stdin=subprocess.PIPE)
+                )
+            os.environ.update({**common, "RANK": "0", "LOCAL_RANK": "0", "NODE_RANK": "0"})
+            yield Ranks(0, devices)
+            for worker in workers:
+                worker.wait(timeout=60)
+        finally:
+            for worker in workers:
+                worker.kill()
+                worker.wait()
+            os.environ.clear()
+            os.environ.update(before)
+
+
+def job_file(folder: Path) -> Path:
+    """Where rank 0 leaves the job for ranks that a launcher has started, which see the same folder."""
+    return folder / f".job_{os.environ.get('TORCHELASTIC_RUN_ID', 'run')}_{os.environ.get('MASTER_PORT', '')}.pt"
+
+
+def wait_for(file: Path, seconds: float = 3600.0) -> Path:
+    """Waits until rank 0 has made the data and left the job.
+
+    Raises:
+        UserError: it did not.
+    """
+    began = time.monotonic()
+    while not file.exists():
+        if time.monotonic() - began > seconds:
+            raise UserError(f"Rank 0 has not left {file} within {seconds / 60:.0f} minutes: look at its messages.")
+        time.sleep(0.2)
+    return file
+
+
+def end_with_parent() -> None:
+    """Ends this process when rank 0 dies: its end of our standard input is closed then."""
+
+    def watch() -> None:
+        sys.stdin.buffer.read()
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return int(found.getsockname()[1])

@@ -1,0 +1,39 @@
+"""A rank other than 0, started by `apex_lab.training.ranks.started`: trains along and writes nothing."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import torch
+
+from apex_lab.base import console
+from apex_lab.config import components
+from apex_lab.config.schema import Config, build_model
+from apex_lab.training.fit import fit
+from apex_lab.training.ranks import JOB, Ranks, end_with_parent
+
+
+def main() -> None:
+    """Entry point: `python -m apex_lab.training.worker`, with the environment of a rank."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # rank 0 decides when to stop
+    end_with_parent()
+    console.setup()
+    train_along(Path(os.environ[JOB]), Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])))
+
+
+def train_along(file: Path, ranks: Ranks) -> None:
+    """Trains as one of several ranks from what rank 0 has left in a file."""
+    job = torch.load(file, map_location="cpu", weights_only=True)
+    config = Config(**job["config"])
+    model = build_model(config)
+    model.load_state_dict(job["weights"])
+    source = components.build(config.data, "data")
+    source.open()
+    fit(config, model, source, torch.device(job["device"]), job["step"], job["training"], ranks)
+
+
+if __name__ == "__main__":
+    main()
