@@ -51,7 +51,7 @@ def comparison(compared: Row) -> str:
         low, high = found["times_min_max"]
         both = [_speed(compared["models"][model]["frames_per_second"]) for model in ("model", variant)]
         said.append(
-            f"{compared['device']}: the model trains {found['model_trains_times_as_many']:.2f} times as many frames/s as "
+            f"{compared['device']}: trains {found['model_trains_times_as_many']:.2f} times as many frames/s as "
             f'the naive twin "{variant}" ({low:.2f} to {high:.2f}; {" and ".join(both)}; '
             f"batch {compared['batch_size']} x {compared['frames']} frames"
             + ("" if (of := found["times_in_processor_time"]) is None else f"; {of:.2f} in processor time")

@@ -64,7 +64,7 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
         overrides = list(HydraConfig.get().overrides.task)
         name = " ".join(overrides)
         try:
-            job = check(plain(config), _choices(HydraConfig.get().runtime.choices), overrides)
+            job = check(plain(config), _choices(HydraConfig.get().runtime), overrides)
             name = title(job)
             work(job)
         except UserError as error:
@@ -132,7 +132,7 @@ def _check_composed(name: str, extra: Sequence[str], overrides: Sequence[str], c
 
     def attempt(words: Sequence[str]) -> None:
         config = compose(name, overrides=[*extra, *words], return_hydra_config=True)
-        choices = _choices(config.hydra.runtime.choices)
+        choices = _choices(config.hydra.runtime)
         own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
         check(plain(own), choices, overrides)
 
@@ -202,11 +202,12 @@ def _expand(overrides: Sequence[str]) -> list[list[str]]:
     return [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
 
 
-def _choices(choices: Any) -> dict[str, str]:
+def _choices(runtime: Any) -> dict[str, str]:
     """The words chosen on the command line or by default; Hydra's own groups, and a recipe without a file, left out."""
-    found = {str(k): str(v) for k, v in choices.items() if not str(k).startswith("hydra/") and v is not None}
-    model, _, scale = found.get("recipe", "").rpartition("/")
-    if scale not in GlobalHydra.instance().config_loader().get_group_options(f"recipe/{model}"):
+    choices = runtime.choices.items()
+    found = {str(k): str(v) for k, v in choices if not str(k).startswith("hydra/") and v is not None}
+    folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
+    if not any((folder / "recipe" / f"{found.get('recipe')}.yaml").is_file() for folder in folders):
         found.pop("recipe", None)
     return found
 

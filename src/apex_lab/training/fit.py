@@ -78,8 +78,7 @@ def fit(
         accelerator="gpu" if device.type == "cuda" else "cpu",
         devices=settings.devices,
         num_nodes=settings.num_nodes,
-        # a term with weight 0 leaves parameters without gradients
-        strategy=DDPStrategy(find_unused_parameters=True) if ranks.world > 1 else "auto",
+        strategy=DDPStrategy(find_unused_parameters=_some_unused(config, update)) if ranks.world > 1 else "auto",
         # Lightning's own precision: validation runs in it too; the step opens the same for itself
         precision="bf16-mixed" if settings.precision == "bf16-mixed" else "32-true",
         # nothing but the project's own files decides where a run resumes, also under Slurm
@@ -90,6 +89,7 @@ def fit(
         check_val_every_n_epoch=None if settings.validation_interval is not None else 1,
         limit_val_batches=None if settings.validation_interval is not None else 0,
         num_sanity_val_steps=0,
+        log_every_n_steps=1,
         logger=list(loggers),
         callbacks=[*callbacks, LastValidation(settings.max_steps)],
         enable_checkpointing=False,
@@ -120,6 +120,11 @@ def fit(
     trainer.fit(learner, batches, validation if settings.validation_interval is not None else None)
     if ranks.world > 1 and dist.is_initialized():
         dist.destroy_process_group()
+
+
+def _some_unused(config: Config, update: WeightUpdate) -> bool:
+    """Whether a step may leave parameters without gradients: a term without weight, clips too short for propagation."""
+    return len(update.weights.schedules) < len(update.terms) or config.clips.frames is not None
 
 
 def resume_at(trainer: L.Trainer, step: int) -> None:

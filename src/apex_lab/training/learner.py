@@ -158,7 +158,7 @@ class Learner(L.LightningModule):
             total = tally.evaluator.result()["total"]
             row.update({f"val/{k}": total[k] for k in VALIDATION_SCORES if not math.isnan(total.get(k, math.nan))})
         for name, value in row.items():
-            self.log(name, value, logger=False, rank_zero_only=False)
+            self.log(name, value, logger=False, sync_dist=self._ranks > 1)
         self._record(row)
         self._restart_clock()
 

@@ -124,7 +124,7 @@ def end_with_parent() -> None:
     """Ends this process when rank 0 dies: its end of our standard input is closed then."""
 
     def watch() -> None:
-        sys.stdin.buffer.read()
+        os.read(0, 1)
         os.kill(os.getpid(), signal.SIGKILL)
 
     threading.Thread(target=watch, daemon=True).start()
