@@ -75,8 +75,7 @@ class Decoder(nn.Module):
         gradient = torch.cat([colours, logits[:, None]], dim=1).contiguous(memory_format=torch.channels_last)
         for conv, after in zip(reversed(self.others), reversed(decoded.hidden), strict=True):
             gradient = F.conv_transpose2d(gradient, conv.weight, padding=conv.padding)
-            # the slope of the ELU, from its output
-            gradient = torch.addcmul(gradient, gradient, after.clamp_max(0))
+            gradient = torch.ops.aten.elu_backward(gradient, 1, 1, 1, True, after)  # True: from the ELU's output
         pixels = gradient.permute(0, 2, 3, 1).flatten(1, 2)
         return self.first.pull_back(pixels, weights).float()
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -48,6 +48,26 @@ class VectorNorm(nn.Module):
     def forward(self, x: Float[Tensor, "*batch S"]) -> Float[Tensor, "*batch S"]:
         std, mean = torch.std_mean(x, dim=-1, keepdim=True)
         return (x - mean) / (std + 1e-6) * self.scale + self.shift
+
+
+class _PooledElu(torch.autograd.Function):
+    """Mean over the pixels of the ELU.
+
+    Its gradient is written by hand: autograd would first spread the gradient of the mean over a whole tensor, in
+    another order of memory than the ELU's.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:  # type: ignore[override]
+        x = F.elu(x)
+        ctx.save_for_backward(x)
+        return x.mean(dim=(-2, -1))
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
+        (x,) = ctx.saved_tensors
+        each = gradient[..., None, None] / (x.shape[-1] * x.shape[-2])
+        return x.clamp_max(0).add_(1).mul_(each)
 
 
 class Seen(NamedTuple):
@@ -117,7 +137,7 @@ class Refinement(nn.Module):
     def forward(self, seen: Seen, memory: Memory) -> tuple[RawGaussian, Memory]:
         """The new posterior, which replaces the old one, and the LSTM's new state."""
         b, k = seen.logits.shape[:2]
-        pooled = self._features(seen).mean(dim=(-2, -1)).float()
+        pooled = self._features(seen)
         vector = torch.cat(
             [
                 F.elu(self.compress(pooled)).float().unflatten(0, (b, k)),
@@ -132,8 +152,8 @@ class Refinement(nn.Module):
         mean, raw = self.to_mean(hidden).float(), self.to_raw(hidden).float()
         return RawGaussian(mean.unflatten(0, (b, k)), raw.unflatten(0, (b, k))), (hidden, cell)
 
-    def _features(self, seen: Seen) -> Float[Tensor, "N S H W"]:
-        """Feature maps of all slots, N = B K.
+    def _features(self, seen: Seen) -> Float[Tensor, "N S"]:
+        """Features of all slots, pooled over the image; N = B K.
 
         The first convolution is a sum: what all slots of an image share is convolved once.
         """
@@ -143,9 +163,9 @@ class Refinement(nn.Module):
         own = F.conv2d(self._own(seen), of_own, padding=first.padding)
         k = len(own) // len(shared)
         x = F.elu(own + shared.repeat_interleave(k, 0), inplace=True)
-        for conv in others:
+        for conv in others[:-1]:
             x = F.elu(conv(x), inplace=True)
-        return x
+        return _PooledElu.apply(others[-1](x)).float()
 
     def _shared(self, seen: Seen) -> Float[Tensor, "B 6 H W"]:
         density = self.norm_density(seen.mixture.density.detach()[:, None])
