@@ -29,8 +29,9 @@ def array(name: str) -> Tensor:
 
 def assert_near(found: Tensor, wanted: Tensor, tolerance: float = 1e-4) -> None:
     """Within `tolerance` of the largest wanted value."""
+    found, wanted = found.detach(), wanted.detach()
     assert found.shape == wanted.shape
-    assert float((found - wanted).detach().abs().max()) <= tolerance * float(wanted.abs().max())
+    assert float((found - wanted).abs().max()) <= tolerance * float(wanted.abs().max())
 
 
 def test_softplus_of_the_raw_scale_is_the_variance() -> None:

@@ -42,6 +42,7 @@ class Decoder(nn.Module):
         widths = [WIDTH] * (LAYERS - 1) + [4]
         self.others = nn.ModuleList(nn.Conv2d(WIDTH, width, KERNEL, padding=KERNEL // 2) for width in widths[1:])
         for conv in (self.first, *self.others):
+            assert isinstance(conv, nn.Conv2d)
             start_conv(conv)
 
     def prepare(self) -> TiledWeights:
@@ -74,7 +75,8 @@ class Decoder(nn.Module):
         """
         gradient = torch.cat([colours, logits[:, None]], dim=1).contiguous(memory_format=torch.channels_last)
         for conv, after in zip(reversed(self.others), reversed(decoded.hidden), strict=True):
-            gradient = F.conv_transpose2d(gradient, conv.weight, padding=conv.padding)
+            assert isinstance(conv, nn.Conv2d)
+            gradient = F.conv_transpose2d(gradient, conv.weight, padding=KERNEL // 2)
             gradient = torch.ops.aten.elu_backward(gradient, 1, 1, 1, True, after)  # True: from the ELU's output
         pixels = gradient.permute(0, 2, 3, 1).flatten(1, 2)
         return self.first.pull_back(pixels, weights).float()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import torch
@@ -113,9 +114,7 @@ class Refinement(nn.Module):
     def __init__(self, stochastic: int, width: int, size: int) -> None:
         super().__init__()
         widths = (CHANNELS, WIDTH, WIDTH, stochastic)
-        self.convs = nn.ModuleList(
-            nn.Conv2d(a, b, KERNEL, padding=KERNEL // 2) for a, b in zip(widths, widths[1:], strict=False)
-        )
+        self.convs = nn.ModuleList(nn.Conv2d(a, b, KERNEL, padding=KERNEL // 2) for a, b in itertools.pairwise(widths))
         for conv in self.convs:
             assert isinstance(conv, nn.Conv2d)
             start_conv(conv)
@@ -158,9 +157,10 @@ class Refinement(nn.Module):
         The first convolution is a sum: what all slots of an image share is convolved once.
         """
         first, *others = self.convs
+        assert isinstance(first, nn.Conv2d)
         of_shared, of_own = (torch.cat([first.weight[:, part] for part in parts], dim=1) for parts in (SHARED, OWN))
-        shared = F.conv2d(self._shared(seen), of_shared, first.bias, padding=first.padding)
-        own = F.conv2d(self._own(seen), of_own, padding=first.padding)
+        shared = F.conv2d(self._shared(seen), of_shared, first.bias, padding=KERNEL // 2)
+        own = F.conv2d(self._own(seen), of_own, padding=KERNEL // 2)
         k = len(own) // len(shared)
         x = F.elu(own + shared.repeat_interleave(k, 0), inplace=True)
         for conv in others[:-1]:
