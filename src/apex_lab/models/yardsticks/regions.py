@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from apex_lab.models.linking import Linked, link
+from apex_lab.models.yardsticks.linking import Linked, link
 from apex_lab.scene import ABSENT, Scene
 
 BACKGROUND_ID = 0

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from pydantic import Field
 from torch import Tensor
 
-from apex_lab.models.regions import scene_of_regions
+from apex_lab.models.yardsticks.regions import scene_of_regions
 from apex_lab.scene import Context, Scene, SceneModel
 
 SAMPLES = 20_000
@@ -45,7 +45,7 @@ class ColorClusters(SceneModel):
        largest over the whole video (so that it does not jump between table and floor from frame to frame).
     4. Regions of less than `min_area`, and all but the `max_objects` largest, are dissolved: their pixels go to the
        nearest region that stays.
-    5. Regions of consecutive frames are linked (`apex_lab.models.linking.link`).
+    5. Regions of consecutive frames are linked (`apex_lab.models.yardsticks.linking.link`).
 
     A video's result depends on the video alone, and is the same at every call. Defaults were chosen by the four
     segmentation scores of 32 training videos of P2D: labels chose them.

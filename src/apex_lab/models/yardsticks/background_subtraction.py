@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from pydantic import Field
 from torch import Tensor
 
-from apex_lab.models.regions import scene_of_regions
+from apex_lab.models.yardsticks.regions import scene_of_regions
 from apex_lab.scene import Context, Scene, SceneModel, Statistics
 
 
@@ -24,7 +24,7 @@ class BackgroundSubtraction(SceneModel):
     2. The foreground is cleaned by an opening with a disc of `radius` pixels. There is no closing: it would fill the
        gap between the arm and what it pushes.
     3. Its connected regions (8 neighbours) of at least `min_area` are the objects, the `max_objects` largest of them.
-    4. Regions of consecutive frames are linked (`apex_lab.models.linking.link`).
+    4. Regions of consecutive frames are linked (`apex_lab.models.yardsticks.linking.link`).
 
     The reconstruction is the median picture with every object in its mean colour. The median picture is a buffer, so
     checkpoints carry it. Defaults were chosen by the four segmentation scores of 32 training videos of P2D: labels

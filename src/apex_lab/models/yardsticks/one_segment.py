@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from apex_lab.models.regions import scene_of_regions
+from apex_lab.models.yardsticks.regions import scene_of_regions
 from apex_lab.scene import Context, Scene, SceneModel
 
 

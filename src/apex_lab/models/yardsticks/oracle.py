@@ -9,7 +9,7 @@ from jaxtyping import Float, Integer
 from pydantic import Field
 from torch import Tensor
 
-from apex_lab.models.regions import hard_scene, one_hot
+from apex_lab.models.yardsticks.regions import hard_scene, one_hot
 from apex_lab.scene import ABSENT, Context, Scene, SceneModel
 
 
