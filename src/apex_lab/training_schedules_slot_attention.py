@@ -14,8 +14,8 @@ from apex_lab.schedules import Schedule, Steps
 class WarmupDecay(Schedule):
     """From 0 in a straight line over `warmup` steps, times an exponential that halves every `half_life` steps.
 
-    Both count from step 0, so the decay runs during the warm-up too: with 10,000 and 100,000 the largest value is 0.933,
-    at step 10,000 (slot_attention.md section 1).
+    Both count from step 0, so the decay runs during the warm-up too: with 10,000 and 100,000 the largest value is
+    0.933, at step 10,000 (slot_attention.md section 1).
     """
 
     warmup: Steps

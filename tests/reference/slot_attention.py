@@ -37,19 +37,16 @@ def perceptron(x: Tensor, weights: Weights, name: str) -> Tensor:
 
 
 def positions(height: int, width: int, dtype: torch.dtype) -> Tensor:
-    grid = torch.zeros(height, width, 4, dtype=dtype)
-    for r in range(height):
-        for c in range(width):
-            row, column = r / (height - 1), c / (width - 1)
-            grid[r, c] = torch.tensor([row, column, 1 - row, 1 - column], dtype=dtype)
-    return grid
+    axes = (torch.linspace(0, 1, n, dtype=dtype) for n in (height, width))
+    row, column = torch.meshgrid(*axes, indexing="ij")
+    return torch.stack([row, column, 1 - row, 1 - column], dim=-1)
 
 
 def encode(image: Tensor, weights: Weights, strides: Sequence[int]) -> Tensor:
     """(3, H, W) in [-1, 1] -> tokens (L, C)."""
     x = image[None]
     for i, stride in enumerate(strides):
-        name = f"encoder.convs.{i}.0"
+        name = f"encoder.convs.{i}"
         x = F.conv2d(x, weights[f"{name}.weight"], weights[f"{name}.bias"], stride, 2).relu()
     x = x[0].permute(1, 2, 0)
     x = x + linear(positions(*x.shape[:2], x.dtype), weights, "encoder.position.linear")
@@ -84,7 +81,7 @@ def decode(slots: Tensor, weights: Weights, strides: Sequence[int], size: int) -
     position = linear(positions(size, size, slots.dtype), weights, "decoder.position.linear").permute(2, 0, 1)
     x = slots[:, :, None, None].repeat(1, 1, size, size) + position
     for i, stride in enumerate(strides):
-        name = f"decoder.convs.{i}.0"
+        name = f"decoder.convs.{i - 1}" if i else "decoder.first"
         x = F.conv_transpose2d(
             x, weights[f"{name}.weight"], weights[f"{name}.bias"], stride, padding=2, output_padding=stride - 1
         ).relu()

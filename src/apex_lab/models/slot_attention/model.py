@@ -112,10 +112,10 @@ class SlotAttention(SceneModel):
         images = 2 * video.flatten(0, 1) - 1
         start = video.new_empty(b * t, self.slots, self.slot_size)
         slots = self.grouping(self.encoder(images), context.noise.at(0, t).normal(start), self.iterations)
-        drawn = self.decoder(slots.flatten(0, 1)).unflatten(0, (b * t, self.slots)).float()
+        drawn = _precise(self.decoder(slots.flatten(0, 1))).unflatten(0, (b * t, self.slots))
         colours, masks = drawn[:, :, :3], drawn[:, :, 3:].softmax(dim=1)
         mixed = (masks * colours).sum(dim=1)
-        error = (mixed - images.float()).square().mean(dim=(1, 2, 3))
+        error = (mixed - images).square().mean(dim=(1, 2, 3))
         masks = masks.squeeze(2).unflatten(0, (b, t))
         return Scene(
             masks=masks,
@@ -147,9 +147,8 @@ class Encoder(nn.Module):
     def __init__(self, features: int, strides: Sequence[int], padding: Padding) -> None:
         super().__init__()
         inputs = (3, *[features] * (len(strides) - 1))
-        self.convs = nn.Sequential(
-            *(nn.Sequential(SameConv2d(c, features, 5, s, padding), nn.ReLU(inplace=True)) for c, s in zip(inputs, strides))
-        )
+        sizes = zip(inputs, strides, strict=True)
+        self.convs = nn.ModuleList(SameConv2d(channels, features, 5, stride, padding) for channels, stride in sizes)
         self.position = PositionEmbedding(features)
         self.norm = nn.LayerNorm(features, eps=NORM_EPS)
         self.mlp = nn.Sequential(nn.Linear(features, features), nn.ReLU(inplace=True), nn.Linear(features, features))
@@ -157,7 +156,13 @@ class Encoder(nn.Module):
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N L C"]:
         # Channels last: tokens then are the feature map itself, not a copy, and convolutions are faster.
-        maps = self.convs(images.contiguous(memory_format=torch.channels_last))
+        maps = images.contiguous(memory_format=torch.channels_last)
+        for conv in self.convs:
+            maps = conv(maps).relu_()
+        return self.tokens(maps)
+
+    def tokens(self, maps: Float[Tensor, "N C h w"]) -> Float[Tensor, "N L C"]:
+        """Pixels of a feature map, told where they are and normalised one by one."""
         maps = maps + self.position(*maps.shape[-2:])
         return self.mlp(self.norm(maps.permute(0, 2, 3, 1).flatten(1, 2)))
 
@@ -205,13 +210,13 @@ class Grouping(nn.Module):
         q = self.to_q(self.norm_slots(slots)) * slots.shape[-1] ** -0.5
         # With k = W x, k . q is x . (W^T q): slots are few and tokens many, so keys are not made. Values neither.
         logits = (q @ self.to_k.weight) @ tokens.transpose(1, 2)
-        return logits.float().softmax(dim=1)
+        return _precise(logits).softmax(dim=1)
 
     def update(
         self, slots: Float[Tensor, "N K D"], attention: Float[Tensor, "N K L"], tokens: Float[Tensor, "N L C"]
     ) -> Float[Tensor, "N K D"]:
         """Slots after a round, each from the mean of the (normalised) tokens' values under its attention."""
-        weights = attention + ATTENTION_EPS  # float32: the epsilon vanishes in half precision
+        weights = attention + ATTENTION_EPS
         weights = weights / weights.sum(dim=2, keepdim=True)
         values = self.to_v(weights.to(tokens.dtype) @ tokens)
         slots = self.gru(values.flatten(0, 1), slots.flatten(0, 1)).view_as(slots)
@@ -227,13 +232,9 @@ class Decoder(nn.Module):
         super().__init__()
         self.grid = image_size // math.prod(strides)
         self.position = PositionEmbedding(slot_size)
-        inputs = (slot_size, *[features] * (len(strides) - 1))
-        self.convs = nn.Sequential(
-            *(
-                nn.Sequential(SameConvTranspose2d(c, features, 5, s, padding), nn.ReLU(inplace=True))
-                for c, s in zip(inputs, strides)
-            )
-        )
+        first, *others = strides
+        self.first = SameConvTranspose2d(slot_size, features, 5, first, padding)
+        self.convs = nn.ModuleList(SameConvTranspose2d(features, features, 5, stride, padding) for stride in others)
         self.head = SameConvTranspose2d(features, 4, 3, 1, padding)
         self.largest = features * image_size**2
         _initialise(self)
@@ -244,14 +245,14 @@ class Decoder(nn.Module):
         return joined(self._draw(part, position) for part in slots.split(size))
 
     def _draw(self, slots: Float[Tensor, "M D"], position: Float[Tensor, "D h w"]) -> Float[Tensor, "M 4 H W"]:
-        copies, (first, *others) = slots[:, :, None, None], self.convs
-        if first[0].stride == (1, 1) and self.grid > 2 * EDGE:
-            maps = _of_copies(copies, first[0], self.grid) + first[0](position[None])
-            maps = first[1](maps.contiguous(memory_format=torch.channels_last))
+        copies = slots[:, :, None, None]
+        if self.first.stride == (1, 1) and self.grid > 2 * EDGE:
+            maps = _of_copies(copies, self.first, self.grid) + self.first(position[None])
+            maps = maps.contiguous(memory_format=torch.channels_last).relu_()
         else:
-            maps = first((copies + position).contiguous(memory_format=torch.channels_last))
-        for conv in others:
-            maps = conv(maps)
+            maps = self.first((copies + position).contiguous(memory_format=torch.channels_last)).relu_()
+        for conv in self.convs:
+            maps = conv(maps).relu_()
         return self.head(maps)
 
 
@@ -313,6 +314,11 @@ def _initialise(module: nn.Module) -> None:
             nn.init.xavier_uniform_(part.weight)
             if part.bias is not None:
                 nn.init.zeros_(part.bias)
+
+
+def _precise(x: Tensor) -> Tensor:
+    """At least float32: in half precision epsilons vanish and shares no longer sum to 1."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
 
 
 def _as_rgb(values: Tensor) -> Tensor:
