@@ -61,8 +61,7 @@ class SlotAttention(SceneModel):
     slots and of iterations can be changed at any time: no weight depends on either (`model.slots = 7`).
 
     Args:
-        image_size: H = W in pixels; a multiple of 16 for the decoders of `released` and `strided`, of which the tokens
-            of `strided` need 4.
+        image_size: H = W in pixels; a multiple of 16, but for `small`.
         slots: K.
         iterations: rounds of attention.
         variant: `released`: the published encoder, whose convolutions all have stride 1, so every pixel is a token.
