@@ -20,7 +20,7 @@ from apex_lab.models.slot_attention.model import (
 )
 from apex_lab.nn.noise import VideoNoise
 from apex_lab.scene import Context, Noise, Scene
-from apex_lab.training_schedules_slot_attention import WarmupDecay
+from apex_lab.training.schedules import WarmupDecay
 from tests.reference import slot_attention as naive
 
 SIDE = 32
@@ -327,7 +327,7 @@ def test_gradients_reach_all_parameters(variant: str) -> None:
 def test_parts_on_a_cpu_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     model, x = tiny(), video()
     whole = evaluate(model, x)
-    monkeypatch.setattr("apex_lab.nn.parts.CACHED", 3 * 4 * model.decoder.largest)
+    monkeypatch.setattr("apex_lab.nn.splitting.CACHED", 3 * 4 * model.decoder.largest)
     torch.testing.assert_close(evaluate(model, x).masks, whole.masks)
 
 

@@ -9,9 +9,9 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from apex_lab import training_schedules_slot_attention
-from apex_lab.components import build, check
+from apex_lab.config.components import build, check
 from apex_lab.models.slot_attention import SlotAttention
+from apex_lab.training import schedules as training_schedules_slot_attention
 
 CONF = Path(__file__).parents[3] / "conf"
 SIDES = {"paper": 128, "cpu": 64, "quickstart": 64, "smoke": 32}

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from apex_lab.nn.parts import joined, part_size
+from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import Context, Scene, SceneModel
 
 Count = Annotated[int, Field(gt=0)]
