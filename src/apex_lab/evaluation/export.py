@@ -6,9 +6,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, Subset
 
 from apex_lab.evaluation.parts import Tally
+from apex_lab.metrics import ObjectMetadata, p2d_metadata
 from apex_lab.predictions import PredictedVideo, open_writer
 
 Export = Literal["npz", "coco", "weis", "davis", "mots", "mot"]
@@ -41,14 +42,33 @@ def write(
         The paths, predictions first.
     """
     paths = []
+    ignore_label = next((part.evaluator.settings.ignore_label for part in parts), None)
     for truth in (False,) if format == "npz" else (False, True):
         path = export_path(folder, split, format, truth)
         for draft in path.parent.glob(f".{path.name}.*"):
             draft.unlink()  # left by a kill in the middle of writing
-        with open_writer(format, path, truth) as writer:
+        with open_writer(format, path, truth, ignore_label) as writer:
             for part in parts:
                 for name, (identities, backgrounds) in part.identities.items():
-                    labels = dataset[part.positions[name]]["segmentation"].numpy()
-                    writer.add(PredictedVideo(name, identities, labels, background_ids=backgrounds))
+                    place = part.positions[name]
+                    labels = dataset[place]["segmentation"].numpy()
+                    writer.add(
+                        PredictedVideo(
+                            name, identities, labels, background_ids=backgrounds, objects=objects_of(dataset, place)
+                        )
+                    )
         paths.append(path)
     return paths
+
+
+def objects_of(dataset: Dataset[dict[str, Any]], place: int) -> ObjectMetadata | None:
+    """What a data set knows of a video's objects, if it says anything (`P2D.meta`).
+
+    Args:
+        dataset: the split, or a part of it.
+        place: of the video in `dataset`.
+    """
+    while isinstance(dataset, Subset):
+        place, dataset = dataset.indices[place], dataset.dataset
+    meta = getattr(dataset, "meta", None)
+    return None if meta is None else p2d_metadata(meta(place))

@@ -59,7 +59,7 @@ def contingency(prediction: Labels, truth: Labels, ignore_label: int | None = No
     """
     check_labels(prediction, truth, ignore_label)
     videos, frames = truth.shape[:2]
-    ignored = None if ignore_label is None else (truth == ignore_label).flatten(1)
+    ignored = None if ignore_label is None else (truth.long() == ignore_label).flatten(1)
     rows, labels = compact(truth.flatten(1).long(), keep_zero=True, left_out=ignored)
     columns, ids = compact(prediction.flatten(1).long(), left_out=ignored)
     n_rows, n_columns = labels.shape[1], ids.shape[1]
@@ -119,7 +119,7 @@ def check_labels(prediction: Tensor, truth: Tensor, ignore_label: int | None = N
         )
     if truth.numel() == 0:
         raise ValueError(f"label maps of shape {tuple(truth.shape)} hold no pixel")
-    known = truth if ignore_label is None else truth[truth != ignore_label]
+    known = truth if ignore_label is None else truth[truth.long() != ignore_label]
     smallest = int(known.min()) if known.numel() else 0
     if smallest < 0:
         raise ValueError(
