@@ -13,11 +13,11 @@ from pycocotools import mask as pycoco
 from apex_lab.errors import UserError
 from apex_lab.metrics.bench import synthetic_video
 from apex_lab.predictions import EXPORTS, PredictedVideo, open_truth, open_writer, score_predictions
+from apex_lab.predictions.davis import palette, read_davis
+from apex_lab.predictions.mots import read_mots
 from apex_lab.predictions.rle import decode, encode
 from apex_lab.predictions.truth import load_json
 from apex_lab.predictions.weis import read_weis
-from apex_lab.predictions.davis import palette, read_davis
-from apex_lab.predictions.mot import read_mots
 
 
 def videos() -> Iterator[PredictedVideo]:
@@ -204,7 +204,7 @@ BAD_WEIS: dict[str, tuple[Any, str]] = {
     "id": ([[{"ids": [-1], "masks": [RLE]}]], "the id -1 is no integer >= 0"),
     "kind of id": ([[{"ids": ["a"], "masks": [RLE]}]], "the id 'a' is no integer"),
     "twice": ([[{"ids": [3, 3], "masks": [RLE, RLE]}]], "has the id 3 more than once"),
-    "overlap": ([[{"ids": [3, 4], "masks": [RLE, RLE]}]], "the mask of id 4 covers pixels of another"),
+    "overlap": ([[{"ids": [3, 4], "masks": [RLE, RLE]}]], "frame 0, id 4: the mask covers pixels of another"),
     "size": ([[{"ids": [3], "masks": [{**RLE, "size": [4, 1]}]}]], "a mask is 4 x 1, the ground truth 2 x 2"),
     "runs": ([[{"ids": [3], "masks": [{**RLE, "counts": "01"}]}]], "do not fill its 2 x 2 pixels"),
     "empty": ([[{"ids": [3], "masks": [{**RLE, "counts": ""}]}]], "do not fill"),

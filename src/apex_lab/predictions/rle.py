@@ -24,7 +24,7 @@ def paint(
         mask: see `decode`.
         name: what to write.
         empty: what stands where no mask was painted.
-        where: for messages.
+        where: file, place and id of the mask, for messages.
         size_of: what else has the size of `labels`, for messages.
 
     Raises:
@@ -32,7 +32,7 @@ def paint(
     """
     pixels = decode(mask, (labels.shape[0], labels.shape[1]), where, size_of)
     if (labels[pixels] != empty).any():
-        raise UserError(f"{where}: the mask of id {name} covers pixels of another; masks must not overlap")
+        raise UserError(f"{where}: the mask covers pixels of another; masks must not overlap")
     labels[pixels] = name
 
 

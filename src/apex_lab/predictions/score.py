@@ -85,10 +85,11 @@ def score_predictions(
         raise UserError(f"format is {format!r}; choose one of {', '.join(get_args(Format))}")
     if resize not in (None, *get_args(Resize)):
         raise UserError(f"resize is {resize!r}; choose one of {', '.join(get_args(Resize))}, or leave it out")
-    known = _Labels(open_truth(truth, split), settings.ignore_label) if truth is not None else None
-    if known is None and format == "npz":
-        known = _Labels(NpzTruth(path), settings.ignore_label)
-    if known is None:
+    if truth is not None:
+        known = _Labels(open_truth(truth, split), str(truth), settings.ignore_label)
+    elif format == "npz":
+        known = _Labels(NpzTruth(path), str(path), settings.ignore_label)
+    else:
         raise UserError(f"{path} holds no ground truth; name it with truth=FILE or truth=FOLDER")
     evaluator = Evaluator(settings)
     for video in _read(path, format, known, partial, resize, track):
@@ -96,7 +97,7 @@ def score_predictions(
             evaluator.add(video.name, video.prediction, video.truth, video.metadata)
         except ValueError as error:
             raise UserError(f"{path}: {error}") from error
-    known.warn(str(truth or path))
+    known.warn()
     source = {"predictions": str(path), "format": format, "truth": str(truth or path), "resize": resize}
     documented = {name: asdict(key) for name, key in keys(settings.public_first_frame).items()}
     return {"format_version": FORMAT_VERSION, "source": source, "keys": documented, **evaluator.result()}
@@ -153,26 +154,26 @@ def plain(value: Any) -> Any:
 class _Labels:
     """Ground truth, checked, and what in it looks like pixels that nobody has labelled."""
 
-    def __init__(self, truth: Truth, ignore_label: int | None) -> None:
-        self.truth, self.ignore_label = truth, ignore_label
+    def __init__(self, truth: Truth, source: str, ignore_label: int | None) -> None:
+        self.truth, self.source, self.ignore_label = truth, source, ignore_label
         self.names = truth.names
         self._void: dict[int, list[str]] = {}
 
     def of(self, name: str) -> Integer[np.ndarray, "T H W"]:
         """True labels of one video."""
         labels = self.truth.labels(name)
-        check_labels(labels, f"the ground truth of video {name!r}", self.ignore_label)
+        check_labels(labels, f"{self.source}, video {name!r}", self.ignore_label)
         if self.ignore_label is None:
             void = void_label(self.truth, name, labels)
             if void is not None and name not in self._void.setdefault(void, []):
                 self._void[void].append(name)
         return labels
 
-    def warn(self, source: str) -> None:
+    def warn(self) -> None:
         """Names labels that were scored as objects and probably are none."""
         for label, names in self._void.items():
             console.warn(
-                f"{source}: label {label} was scored as an object in {len(names)} videos, the first is {names[0]!r}; "
+                f"{self.source}: label {label} was scored as an object in {len(names)} videos, first in {names[0]!r}; "
                 f"where it marks unlabelled pixels, set scoring.ignore_label={label}"
             )
 

@@ -116,7 +116,7 @@ def _identities(frames: list[Any], shape: tuple[int, int, int], where: str) -> I
         for t, frame in enumerate(frames):
             here = f"{where}, frame {t}"
             for name, mask in _checked(frame, here):
-                paint(found[t], mask, name, ABSENT, here)
+                paint(found[t], mask, name, ABSENT, f"{here}, id {name}")
 
     return with_rest(place, shape)
 
@@ -177,7 +177,7 @@ class WeisTruth:
             where = f"{self._path}, video {name!r}, frame {t}"
             masks = [(label, mask) for label, (_, mask) in zip(frame["labels"], _checked(frame, where), strict=True)]
             for label, mask in [*masks, *([frame["ignored"]] if "ignored" in frame else [])]:
-                paint(found[t], mask, int(label), UNPAINTED, where, "the frame")
+                paint(found[t], mask, int(label), UNPAINTED, f"{where}, label {label}", "the frame")
         return np.where(found == UNPAINTED, BACKGROUND, found)
 
     def metadata(self, name: str) -> None:
