@@ -1,4 +1,4 @@
-"""Pixels of the ground truth that are left out of every metric (docs/metrics.md, "Ignored pixels")."""
+"""Pixels of the ground truth that are left out of every metric (metrics.md section 5)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which file is which frame: by the number in its name, never by its place in a sorted list of names."""
+"""Which file is which frame: by the number in its name, never by its place in a list (metrics.md section 6)."""
 
 from __future__ import annotations
 
