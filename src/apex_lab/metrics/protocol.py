@@ -146,8 +146,8 @@ warning where the key is absent.
 
 ## 6. Files
 Frames of image folders are found by the number in their names, videos listed in natural order (v2 before v10).
-Prediction and truth pair by frame number; where one side has no numbers, the other's must run without gaps from 0 or
-1. What does not pair is refused. Exports can be scored again and give the same numbers (of a model with several
+Prediction and truth pair by frame number; where one side has no numbers, the other's must start at 0 or 1 and have no
+gaps. What does not pair is refused. Exports can be scored again and give the same numbers (of a model with several
 background components, `npz` and `weis` alone: the others leave the background out), and their truth files serve as
 `truth=`:
 
