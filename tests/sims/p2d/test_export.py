@@ -88,7 +88,7 @@ def test_mot_boxes_are_those_of_the_masks(root: Path, mot: Path):
     for split in ("train", "val"):
         stored = arrays(root, split)
         names = (mot / "seqmaps" / f"P2D-{split}.txt").read_text().split()
-        assert names == ["name", *(f"P2D-{split}-{index:06d}" for index in range(len(stored["rgb"])))]
+        assert names == ["name", *(f"{split}_{index:05d}" for index in range(len(stored["rgb"])))]
         for index, name in enumerate(names[1:]):
             folder = mot / f"P2D-{split}" / name
             table = motmetrics.io.loadtxt(folder / "gt" / "gt.txt", fmt="mot16", min_confidence=1)
@@ -106,7 +106,7 @@ def test_mot_boxes_are_those_of_the_masks(root: Path, mot: Path):
 
 def test_mot_sequences_describe_themselves(root: Path, mot: Path):
     stored = arrays(root, "val")
-    folder = mot / "P2D-val" / "P2D-val-000001"
+    folder = mot / "P2D-val" / "val_00001"
     info = configparser.ConfigParser()
     info.read(folder / "seqinfo.ini")
     sequence = info["Sequence"]
