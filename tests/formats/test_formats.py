@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from apex_lab.metrics.bench import synthetic_video
 from PIL import Image
 from pycocotools import mask as pycoco
 
@@ -18,6 +17,7 @@ from apex_lab.formats.mots import read_mots
 from apex_lab.formats.rle import decode, encode
 from apex_lab.formats.truth import load_json
 from apex_lab.formats.weis import read_weis
+from apex_lab.metrics.bench_scoring import synthetic_video
 
 
 def videos() -> Iterator[PredictedVideo]:

@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from apex_lab.metrics.bench import synthetic_video
 from PIL import Image
 
 from apex_lab.base.errors import UserError
 from apex_lab.formats import NpzWriter, PredictedVideo, open_truth, open_writer, score_predictions
 from apex_lab.formats.davis import palette, read_davis, video_names
 from apex_lab.formats.mots import read_mots
+from apex_lab.metrics.bench_scoring import synthetic_video
 
 
 def pictures(folder: Path, labels: np.ndarray, name: str = "{}.png", start: int = 0) -> Path:

@@ -10,7 +10,6 @@ from typing import Any
 import motmetrics
 import numpy as np
 import pytest
-from apex_lab.metrics.bench import synthetic_video
 from PIL import Image
 from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
@@ -18,6 +17,7 @@ from pycocotools.cocoeval import COCOeval
 from apex_lab.data import P2D
 from apex_lab.formats import PredictedVideo, open_writer, p2d_video_name
 from apex_lab.metrics import Evaluator, EvaluatorSettings, TrackingSettings, p2d_metadata
+from apex_lab.metrics.bench_scoring import synthetic_video
 from sims.p2d.export import export as export_p2d
 from tests.fakes.p2d_tools import make, small
 from tests.trackeval_python import ask_trackeval, needs_trackeval

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from apex_lab.metrics.bench import synthetic_video
 
 from apex_lab import console
 from apex_lab.base.errors import UserError
 from apex_lab.formats import PredictedVideo, open_truth, open_writer, score_predictions
 from apex_lab.metrics import EvaluatorSettings
+from apex_lab.metrics.bench_scoring import synthetic_video
 from sims.p2d.export import export as export_p2d
 from tests.fakes.p2d_tools import make, small
 

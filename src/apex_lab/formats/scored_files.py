@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Int64, Integer
 
-from apex_lab import console
+from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.formats.coco import CocoTruth, Places, read_results, videos_with_results
 from apex_lab.formats.davis import frame_files, read_davis, video_names
