@@ -48,7 +48,7 @@ def load_pybullet_data() -> str:
 
 
 class Client:
-    """One private PyBullet server without a window."""
+    """A private PyBullet server in direct mode (no GUI)."""
 
     def __init__(self) -> None:
         self.module = load_pybullet()

@@ -1,4 +1,4 @@
-"""What is made once: whole or not at all, by one of many processes."""
+"""The cache of derived files: made once and atomically, by one of many processes."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_another_recipe_is_another_folder() -> None:
     assert cache.made_once("thing", {"a": 1}, _slow_make) != cache.made_once("thing", {"a": 2}, _slow_make)
 
 
-def test_without_pybullet_one_sentence_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_pybullet_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
     with pytest.raises(SimError, match=r"PyBullet is not installed: run `pip install pybullet`"):
         bullet.load_pybullet()
