@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from apex_lab import console
+from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.formats import PredictedVideo, open_truth, open_writer, score_predictions
 from apex_lab.metrics import EvaluatorSettings
