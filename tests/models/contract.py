@@ -122,7 +122,7 @@ class Private(Noise):
 
 def call(model: SceneModel, video: Tensor, labels: Tensor, context: Context) -> Scene:
     """The model's scene, from the labels where it reads them."""
-    return model.from_labels(video, labels) if model.needs_labels else model(video, context)
+    return model.from_labels(video, labels, context) if model.needs_labels else model(video, context)
 
 
 # --- one scene ---

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from apex_lab.nn.precision import full
 from apex_lab.nn.tiled_conv import TiledConv, TiledWeights
 
 WIDTH, KERNEL, LAYERS = 32, 5, 5
@@ -57,7 +58,7 @@ class Decoder(nn.Module):
         for conv in self.others[:-1]:
             x = F.elu(conv(x), inplace=True)
             hidden.append(x)
-        drawn = self.others[-1](x).float().contiguous()
+        drawn = full(self.others[-1](x)).contiguous()
         return Decoded(drawn[:, :3], drawn[:, 3], tuple(hidden))
 
     @torch.no_grad()
@@ -79,7 +80,7 @@ class Decoder(nn.Module):
             gradient = F.conv_transpose2d(gradient, conv.weight, padding=KERNEL // 2)
             gradient = torch.ops.aten.elu_backward(gradient, 1, 1, 1, True, after)  # True: from the ELU's output
         pixels = gradient.permute(0, 2, 3, 1).flatten(1, 2)
-        return self.first.pull_back(pixels, weights).float()
+        return full(self.first.pull_back(pixels, weights))
 
 
 def start_conv(conv: nn.Conv2d) -> None:

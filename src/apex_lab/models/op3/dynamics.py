@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from apex_lab.models.op3.posterior import RawGaussian
+from apex_lab.nn.precision import full
 
 EFFECT = 32
 
@@ -63,6 +64,6 @@ class Dynamics(nn.Module):
         effects = (self.attention(pairs) * self.effect(pairs) * others[..., None]).sum(2)
         merged = self.merge(torch.cat([each, effects], dim=-1))
         return Predicted(
-            self.to_deterministic(merged).float(),
-            RawGaussian(self.to_mean(merged).float(), self.to_raw(merged).float()),
+            full(self.to_deterministic(merged)),
+            RawGaussian(full(self.to_mean(merged)), full(self.to_raw(merged))),
         )

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from apex_lab.models.op3.decoder import KERNEL, WIDTH, start_conv
 from apex_lab.models.op3.likelihood import ImageGradients, Mixture
 from apex_lab.models.op3.posterior import RawGaussian
+from apex_lab.nn.precision import full
 from apex_lab.nn.tiled_conv import coordinate_maps
 
 CHANNELS = 17
@@ -139,7 +140,7 @@ class Refinement(nn.Module):
         pooled = self._features(seen)
         vector = torch.cat(
             [
-                F.elu(self.compress(pooled)).float().unflatten(0, (b, k)),
+                full(F.elu(self.compress(pooled))).unflatten(0, (b, k)),
                 self.norm_mean(seen.to_mean),
                 self.norm_raw(seen.to_raw),
                 *seen.posterior,
@@ -148,7 +149,7 @@ class Refinement(nn.Module):
             dim=-1,
         )
         hidden, cell = self.lstm(vector.flatten(0, 1), memory)
-        mean, raw = self.to_mean(hidden).float(), self.to_raw(hidden).float()
+        mean, raw = full(self.to_mean(hidden)), full(self.to_raw(hidden))
         return RawGaussian(mean.unflatten(0, (b, k)), raw.unflatten(0, (b, k))), (hidden, cell)
 
     def _features(self, seen: Seen) -> Float[Tensor, "N S"]:
@@ -165,7 +166,7 @@ class Refinement(nn.Module):
         x = F.elu(own + shared.repeat_interleave(k, 0), inplace=True)
         for conv in others[:-1]:
             x = F.elu(conv(x), inplace=True)
-        return _PooledElu.apply(others[-1](x)).float()
+        return full(_PooledElu.apply(others[-1](x)))
 
     def _shared(self, seen: Seen) -> Float[Tensor, "B 6 H W"]:
         density = self.norm_density(seen.mixture.density.detach()[:, None])

@@ -100,7 +100,7 @@ class BackgroundSubtraction(SceneModel):
             labels.unflatten(0, video.shape[:2]).to(video.device),
             self.max_objects + 1,
             background=median,
-            state=context.state,
+            context=context,
         )
 
     def _components(self, foreground: np.ndarray) -> Int[np.ndarray, "H W"]:

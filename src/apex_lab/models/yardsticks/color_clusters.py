@@ -81,7 +81,7 @@ class ColorClusters(SceneModel):
         """RGB video in [0, 1]; `context` has no influence. Works on the CPU, wherever the video lies."""
         pixels = np.ascontiguousarray(video.permute(0, 1, 3, 4, 2).cpu().float().numpy())
         labels = torch.from_numpy(np.stack([self._segment(frames) for frames in pixels]))
-        return scene_of_regions(video, labels.to(video.device), self.max_objects + 1)
+        return scene_of_regions(video, labels.to(video.device), self.max_objects + 1, context=context)
 
     def _segment(self, frames: Float[np.ndarray, "T H W 3"]) -> Int[np.ndarray, "T H W"]:
         """One RGB video -> component of every pixel, 0 the background, objects from the largest down."""

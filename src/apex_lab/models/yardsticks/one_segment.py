@@ -22,4 +22,4 @@ class OneSegment(SceneModel):
         """RGB video in [0, 1]; `context` has no influence."""
         batch, frames, _, height, width = video.shape
         labels = torch.zeros(batch, frames, height, width, dtype=torch.long, device=video.device)
-        return scene_of_regions(video, labels, components=1, state=context.state)
+        return scene_of_regions(video, labels, components=1, context=context)

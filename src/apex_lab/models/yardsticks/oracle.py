@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Annotated
 
 import torch
@@ -38,7 +39,12 @@ class Oracle(SceneModel):
         """
         raise TypeError("Oracle reads the ground truth: call from_labels(video, segmentation) in place of forward")
 
-    def from_labels(self, video: Float[Tensor, "B T 3 H W"], segmentation: Integer[Tensor, "B T H W"]) -> Scene:
+    def from_labels(
+        self,
+        video: Float[Tensor, "B T 3 H W"],
+        segmentation: Integer[Tensor, "B T H W"],
+        context: Context | None = None,
+    ) -> Scene:
         """RGB video in [0, 1] and its labels -> the perfect scene.
 
         An object has an identity in the frames in which it has a pixel.
@@ -61,4 +67,5 @@ class Oracle(SceneModel):
         ids = torch.arange(self.components, device=video.device).where(visible, ABSENT)
         appearance = torch.eye(self.components, device=video.device, dtype=video.dtype).expand(*ids.shape, -1)
         means = video[:, :, None].expand(*masks.shape[:3], *video.shape[2:])
-        return hard_scene(labels, masks, ids, appearance, means)
+        scene = hard_scene(labels, masks, ids, appearance, means)
+        return scene if context is not None and context.detail else dataclasses.replace(scene, means=None)

@@ -6,14 +6,13 @@ Legend: B videos, T frames, K components, H, W image height and width. Component
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from apex_lab.models.yardsticks.linking import Linked, link
-from apex_lab.scene import ABSENT, Scene
+from apex_lab.models.yardsticks.linking import link
+from apex_lab.scene import ABSENT, Context, Scene
 
 BACKGROUND_ID = 0
 """Identity of the background; objects count from 1."""
@@ -36,7 +35,7 @@ def scene_of_regions(
     labels: Int[Tensor, "B T H W"],
     components: int,
     background: Float[Tensor, "3 H W"] | None = None,
-    state: Sequence[Linked] | None = None,
+    context: Context | None = None,
 ) -> Scene:
     """A scene of hard masks: every region is its mean colour, linked over time by `link`.
 
@@ -46,7 +45,7 @@ def scene_of_regions(
             carries no meaning.
         components: K, the same for every video.
         background: image of the background, RGB in [0, 1]; None paints it in its mean colour.
-        state: `Scene.state` of the frames before; None at the start.
+        context: its state is that of the frames before; with its detail the scene has `means`. None: `Context()`.
 
     Returns:
         A scene without loss terms and windows. `appearance` is the mean RGB (A = 3).
@@ -54,16 +53,18 @@ def scene_of_regions(
     masks = one_hot(labels, components)
     colors = mean_colors(video, masks)
     ids = torch.full(masks.shape[:3], BACKGROUND_ID, dtype=torch.long, device=video.device)
+    context = context or Context()
     linked = []
     for b in range(len(video)):
-        before = None if state is None else state[b]
+        before = None if context.state is None else context.state[b]
         found, last = link(masks[b, :, 1:].cpu().numpy(), colors[b, :, 1:].cpu().numpy(), before=before)
         linked.append(last)
         ids[b, :, 1:] = torch.from_numpy(found).to(video.device)
     means = colors[..., None, None].expand(*masks.shape[:3], *video.shape[2:])
     if background is not None:
         means = torch.cat([background.expand_as(means[:, :, :1]), means[:, :, 1:]], dim=2)
-    return dataclasses.replace(hard_scene(labels, masks, ids, colors, means), state=linked)
+    scene = hard_scene(labels, masks, ids, colors, means)
+    return dataclasses.replace(scene, state=linked, means=means if context.detail else None)
 
 
 def hard_scene(
