@@ -306,4 +306,3 @@ class NaiveSpace(nn.Module):
 def relative_error(found: Tensor, expected: Tensor) -> float:
     """Largest difference, relative to the largest expected magnitude."""
     return ((found - expected).abs().max() / expected.abs().max().clamp_min(1e-12)).item()
-

@@ -45,7 +45,7 @@ def test_windows_and_means_come_with_detail_alone(model: Space, scene: Scene) ->
     assert scene.windows[..., -1, :].isnan().all()
     assert scene.windows[..., :-1, :].isfinite().all()
     assert scene.means.shape == (2, 3, 17, 3, 32, 32)
-    assert 0 <= scene.means.min()
+    assert scene.means.min() >= 0
     assert scene.means.max() <= 1 + 1e-6
     with torch.no_grad():
         plain = model(video(), context(noise()))
@@ -55,7 +55,7 @@ def test_windows_and_means_come_with_detail_alone(model: Space, scene: Scene) ->
 
 def test_reconstruction_blends_foreground_and_background(scene: Scene) -> None:
     assert scene.reconstruction.shape == (2, 3, 3, 32, 32)
-    assert 0 <= scene.reconstruction.min()
+    assert scene.reconstruction.min() >= 0
     assert scene.reconstruction.max() <= 1 + 1e-5
 
 

@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 from apex_lab.models.space import Space
 from apex_lab.models.space.background import stick_breaking
-from apex_lab.models.space.networks import BroadcastDecoder, GlimpseDecoder, GlimpseEncoder, ImageEncoder, factors_for
+from apex_lab.models.space.broadcast import BroadcastDecoder
+from apex_lab.models.space.networks import GlimpseDecoder, GlimpseEncoder, ImageEncoder, factors_for
 from tests.models.space.common import close, published
 
 
@@ -69,7 +70,9 @@ def test_the_trunk_gives_the_grid(size: int, grid: int) -> None:
 
 
 def test_strides_at_128_are_the_published_ones() -> None:
-    strides = {g: [m.stride[0] for m in ImageEncoder(128, g).trunk.modules() if isinstance(m, nn.Conv2d)] for g in (16, 8, 4)}
+    strides = {
+        g: [m.stride[0] for m in ImageEncoder(128, g).trunk.modules() if isinstance(m, nn.Conv2d)] for g in (16, 8, 4)
+    }
     assert strides == {16: [2, 2, 2, 1, 1, 1], 8: [2, 2, 2, 1, 2, 1], 4: [2, 2, 2, 2, 2, 1]}
 
 

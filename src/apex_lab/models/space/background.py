@@ -9,9 +9,10 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from apex_lab.models.space.broadcast import BroadcastDecoder
 from apex_lab.models.space.latents import split_gaussian
 from apex_lab.models.space.likelihood import GUARD
-from apex_lab.models.space.networks import BroadcastDecoder, StridedEncoder, mask_decoder, strong_decoder
+from apex_lab.models.space.networks import StridedEncoder, mask_decoder, strong_decoder
 from apex_lab.nn.distributions import Gaussian, kl_gaussian
 from apex_lab.scene import Noise
 
@@ -90,9 +91,7 @@ class Background(nn.Module):
         else:
             self.component_decoder = BroadcastDecoder(component, image_size, width)
 
-    def forward(
-        self, images: Float[Tensor, "n 3 H W"], noise: Noise
-    ) -> tuple[Layers, dict[str, Float[Tensor, " n"]]]:
+    def forward(self, images: Float[Tensor, "n 3 H W"], noise: Noise) -> tuple[Layers, dict[str, Float[Tensor, " n"]]]:
         """RGB in [0, 1] -> the background's components and their KL terms."""
         z_mask, q_mask = self._infer_masks(F.elu(self.image_encoder(images)).float(), noise)
         kl_mask = kl_gaussian(q_mask, self._mask_prior(z_mask))

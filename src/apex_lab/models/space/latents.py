@@ -40,9 +40,7 @@ def split_gaussian(raw: Float[Tensor, "... two_D"], floor: float = 0.0) -> Gauss
     return Gaussian(mean, F.softplus(spread) + floor)
 
 
-def relaxed_presence(
-    logit: Float[Tensor, "..."], temperature: Float[Tensor, ""], noise: Noise
-) -> Float[Tensor, "..."]:
+def relaxed_presence(logit: Float[Tensor, "..."], temperature: Float[Tensor, ""], noise: Noise) -> Float[Tensor, "..."]:
     """Relaxed Bernoulli sample sigmoid((logit + log u - log(1 - u)) / temperature), in training and evaluation."""
     tiny = torch.finfo(logit.dtype).eps
     u = noise.uniform(logit).clamp(tiny, 1 - tiny)

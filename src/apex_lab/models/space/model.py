@@ -97,9 +97,7 @@ class Space(SceneModel):
         alpha, mean = drawn.composition.alpha, drawn.composition.mean
         # Warm-up (section 6): KLs, boundary loss and masks keep the real alpha.
         mixing = torch.where(context.schedule["fix_alpha"] > 0.5, context.schedule["fixed_alpha"], alpha)
-        likelihood = log_likelihood(
-            images, mixing, mean, layers.masks, layers.means, self.sigma_fg, self.sigma_bg
-        )
+        likelihood = log_likelihood(images, mixing, mean, layers.masks, layers.means, self.sigma_fg, self.sigma_bg)
         boundary = self.foreground.boundary(cells, drawn)
         terms = {"nll": -likelihood, **terms, **background_terms, "boundary": boundary}
         backdrop = (layers.masks[:, :, None] * layers.means).sum(1)

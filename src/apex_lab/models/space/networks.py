@@ -6,6 +6,7 @@ component decoder use convolution -> BatchNorm -> ELU. Sizes follow the image si
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -30,6 +31,12 @@ def conv_elu(inputs: int, outputs: int, stride: int, padding: int) -> nn.Sequent
     """3 x 3 convolution, BatchNorm, ELU."""
     conv = nn.Conv2d(inputs, outputs, 3, stride, padding)
     return nn.Sequential(conv, nn.BatchNorm2d(outputs), nn.ELU(inplace=True))
+
+
+def cpu_layout(x: Tensor) -> Tensor:
+    """Channels last on a CPU, where convolutions to few channels, strided and unpadded ones, and BatchNorm are faster
+    so; what follows keeps the layout."""
+    return x.contiguous(memory_format=torch.channels_last) if x.device.type == "cpu" else x
 
 
 def upsample(inputs: int, outputs: int, factor: int, groups: int) -> nn.Sequential:
@@ -133,9 +140,7 @@ class GlimpseDecoder(nn.Module):
         self.mask = nn.Conv2d(16, 1, 3, padding=1)
         self.largest = 16 * size**2
 
-    def forward(
-        self, what: Float[Tensor, "m what"]
-    ) -> tuple[Float[Tensor, "m 1 g g"], Float[Tensor, "m 3 g g"]]:
+    def forward(self, what: Float[Tensor, "m what"]) -> tuple[Float[Tensor, "m 1 g g"], Float[Tensor, "m 3 g g"]]:
         size = part_size(len(what), self.largest, what)
         # one convolution for both heads
         weight = torch.cat([self.mask.weight, self.colour.weight])
@@ -143,7 +148,7 @@ class GlimpseDecoder(nn.Module):
         assert self.colour.bias is not None
         bias = torch.cat([self.mask.bias, self.colour.bias])
         drawn = joined(
-            torch.sigmoid(F.conv2d(self.trunk(part), weight, bias, padding=1))
+            torch.sigmoid(F.conv2d(cpu_layout(self.trunk(part)), weight, bias, padding=1))
             for part in what[..., None, None].split(size)
         )
         return drawn[:, :1], drawn[:, 1:]
@@ -182,13 +187,15 @@ class SubpixelDecoder(nn.Module):
         for factor, (_, channels, groups) in zip(factors, stages, strict=True):
             layers.append(upsample(inputs, channels, factor, groups))
             inputs = channels
-        layers += [conv_celu(inputs, inputs, 3, 1, 1, groups=4), nn.Conv2d(inputs, outputs, 3, padding=1)]
-        self.layers = nn.Sequential(*layers)
+        self.trunk = nn.Sequential(*layers, conv_celu(inputs, inputs, 3, 1, 1, groups=4))
+        self.head = nn.Conv2d(inputs, outputs, 3, padding=1)
         self.largest = inputs * image_size**2
 
     def forward(self, latent: Float[Tensor, "m latent"]) -> Float[Tensor, "m outputs H W"]:
         size = part_size(len(latent), self.largest, latent)
-        return joined(torch.sigmoid(self.layers(part)) for part in latent[..., None, None].split(size))
+        return joined(
+            torch.sigmoid(self.head(cpu_layout(self.trunk(part)))) for part in latent[..., None, None].split(size)
+        )
 
 
 def mask_decoder(latent: int, image_size: int) -> SubpixelDecoder:
@@ -212,81 +219,9 @@ class StridedEncoder(nn.Module):
 
     def __init__(self, image_size: int, channels: Sequence[int], outputs: int) -> None:
         super().__init__()
-        stages = [conv_elu(a, b, stride=2, padding=1) for a, b in zip(channels[:-1], channels[1:], strict=True)]
+        stages = [conv_elu(a, b, stride=2, padding=1) for a, b in itertools.pairwise(channels)]
         self.convs = nn.Sequential(*stages, nn.Flatten())
         self.head = nn.Linear(channels[-1] * (image_size // 16) ** 2, outputs)
 
     def forward(self, images: Float[Tensor, "m C H W"]) -> Float[Tensor, "m outputs"]:
-        return self.head(self.convs(images))
-
-
-class BroadcastDecoder(nn.Module):
-    """Spatial broadcast decoder, z_c -> RGB in (0, 1) (section 5).
-
-    The input is z_c at every pixel of a map 8 pixels larger than the image, plus two channels of coordinates, and four
-    unpadded convolutions bring it to the image's size.
-
-    Args:
-        latent: length of z_c.
-        image_size: side of the image in pixels.
-        width: channels of the convolutions; published: 32.
-    """
-
-    axis: Tensor
-
-    def __init__(self, latent: int, image_size: int, width: int) -> None:
-        super().__init__()
-        self.register_buffer("axis", torch.linspace(-1, 1, image_size + 8), persistent=False)
-        self.first = conv_elu(latent + 2, width, stride=1, padding=0)
-        self.others = nn.Sequential(*(conv_elu(width, width, stride=1, padding=0) for _ in range(3)))
-        self.head = nn.Conv2d(width, 3, 1)
-
-    def forward(self, latent: Float[Tensor, "m latent"]) -> Float[Tensor, "m 3 H W"]:
-        return torch.sigmoid(self.head(self.others(self._first(latent))))
-
-    def _first(self, latent: Tensor) -> Tensor:
-        """`self.first` of the broadcast map, without making that map.
-
-        A convolution of a constant channel is a constant and the coordinates are the same for all, so its result is
-        the sum of a vector per latent and one map. Their mean and variance over latents and pixels are the sums of
-        theirs, so BatchNorm scales the two parts before they are added.
-        """
-        conv, norm = self.first[0], self.first[1]
-        assert isinstance(conv, nn.Conv2d)
-        assert isinstance(norm, nn.BatchNorm2d)
-        length = latent.shape[1]
-        by_latent = F.linear(latent, conv.weight[:, :length].sum((2, 3)), conv.bias)  # (m, width)
-        y, x = torch.meshgrid(self.axis, self.axis, indexing="ij")
-        by_place = F.conv2d(torch.stack([x, y])[None], conv.weight[:, length:])  # (1, width, H + 6, W + 6)
-        with torch.autocast(latent.device.type, enabled=False):
-            by_latent, by_place = by_latent.float(), by_place.float()
-            mean, variance = _moments(norm, by_latent, by_place)
-            gain = norm.weight * torch.rsqrt(variance + norm.eps)
-            by_latent = by_latent * gain + (norm.bias - mean * gain)
-            by_place = _cpu_layout(by_place * gain[:, None, None])
-            return F.elu(by_latent[..., None, None] + by_place, inplace=True)
-
-
-def _cpu_layout(x: Tensor) -> Tensor:
-    """Channels last on a CPU, where unpadded convolutions and BatchNorm are faster so; what follows keeps the layout."""
-    return x.contiguous(memory_format=torch.channels_last) if x.device.type == "cpu" else x
-
-
-def _moments(
-    norm: nn.BatchNorm2d, by_row: Float[Tensor, "m C"], by_place: Float[Tensor, "1 C h w"]
-) -> tuple[Float[Tensor, " C"], Float[Tensor, " C"]]:
-    """Mean and variance of `by_row` + `by_place` that BatchNorm divides by; in training, updates its running ones."""
-    assert norm.running_mean is not None
-    assert norm.running_var is not None
-    if not norm.training:
-        return norm.running_mean, norm.running_var
-    mean = by_row.mean(0) + by_place.mean((0, 2, 3))
-    variance = by_row.var(0, unbiased=False) + by_place.var((0, 2, 3), unbiased=False)
-    count = by_row.shape[0] * by_place[0, 0].numel()
-    with torch.no_grad():
-        assert norm.momentum is not None
-        norm.running_mean.lerp_(mean, norm.momentum)
-        norm.running_var.lerp_(variance * (count / (count - 1)), norm.momentum)
-        assert norm.num_batches_tracked is not None
-        norm.num_batches_tracked.add_(1)
-    return mean, variance
+        return self.head(self.convs(cpu_layout(images)))
