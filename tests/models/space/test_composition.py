@@ -55,7 +55,7 @@ def plain(mask: Tensor, colour: Tensor, depth: Tensor, windows: Tensor, size: in
 
 @pytest.mark.parametrize("cached", [2**22, 4096])
 def test_composition_and_its_gradient_equal_the_plain_equations(cached: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("apex_lab.nn.parts.CACHED", cached)  # 4096: strips of a few rows of one image
+    monkeypatch.setattr("apex_lab.nn.splitting.CACHED", cached)  # 4096: strips of a few rows of one image
     mask, colour, depth, windows = inputs = random_cells(dtype=torch.float32)
     found = compose(mask, colour, depth, Paster(for_paste(windows), 8, 16))
     shares, alpha, mean = plain(*inputs, 16)

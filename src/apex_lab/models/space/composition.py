@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from apex_lab.nn.parts import part_size
 from apex_lab.nn.spatial_transformer import Paster
+from apex_lab.nn.splitting import part_size
 
 IMPORTANCE = 100.0
 KERNEL, FRAME = 32, 6

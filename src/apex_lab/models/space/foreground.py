@@ -26,8 +26,8 @@ from apex_lab.models.space.latents import (
 )
 from apex_lab.models.space.networks import GlimpseDecoder, GlimpseEncoder, ImageEncoder
 from apex_lab.nn.distributions import Gaussian, kl_gaussian, standard_normal
-from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import Paster, crop
+from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import Noise, Schedule
 
 

@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.nn.parts import joined, part_size
+from apex_lab.nn.splitting import joined, part_size
 
 PUBLISHED_SIZE = 128
 """Side in pixels of the images that SPACE was published for."""
