@@ -1,0 +1,143 @@
+"""Discovery's image encoder: the first three stages of a ResNet-18 without max-pooling (gswm.md section 3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor, nn
+
+from apex_lab.models.gswm.networks import norm
+from apex_lab.nn.parts import part_size
+
+Count = Annotated[int, Field(gt=0)]
+Norm = Literal["frame", "clip", "group"]
+
+STRIDE = 8
+"""Of the residual stages and the convolution before them."""
+
+
+class FrameBatchNorm(nn.BatchNorm2d):
+    """Batch normalisation with statistics of one frame of all videos, of many frames at once.
+
+    The published model runs frame by frame, so in training its statistics are those of B images. Here the frames of a
+    video lie side by side as channels, which gives the same numbers, and the same running statistics, in one call.
+    """
+
+    def over(self, images: Float[Tensor, "N C h w"], frames: int) -> Float[Tensor, "N C h w"]:
+        """Images of `frames` frames of every video, videos slowest."""
+        if frames == 1 or not self.training:
+            return self(images)
+        assert self.running_mean is not None
+        assert self.running_var is not None
+        assert self.num_batches_tracked is not None
+        assert self.momentum is not None
+        side_by_side = images.reshape(len(images) // frames, frames * images.shape[1], *images.shape[2:])
+        mean = torch.zeros_like(self.running_mean).repeat(frames)
+        variance = torch.zeros_like(mean)
+        weight, bias = self.weight.repeat(frames), self.bias.repeat(frames)
+        out = F.batch_norm(side_by_side, mean, variance, weight, bias, True, 1.0, self.eps)
+        with torch.no_grad():
+            age = torch.arange(frames - 1, -1, -1, device=mean.device, dtype=mean.dtype)
+            share = self.momentum * (1 - self.momentum) ** age
+            for running, new in ((self.running_mean, mean), (self.running_var, variance)):
+                running.mul_((1 - self.momentum) ** frames).add_(share @ new.view(frames, -1))
+            self.num_batches_tracked.add_(frames)
+        return out.reshape(images.shape)
+
+
+class Residual(nn.Module):
+    """Two 3 x 3 convolutions and a shortcut."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, kind: Norm) -> None:
+        super().__init__()
+        self.conv_1 = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+        self.norm_1 = _norm(outputs, kind)
+        self.conv_2 = nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False)
+        self.norm_2 = _norm(outputs, kind)
+        self.shortcut, self.norm_shortcut = None, None
+        if stride > 1 or inputs != outputs:
+            self.shortcut = nn.Conv2d(inputs, outputs, 1, stride, bias=False)
+            self.norm_shortcut = _norm(outputs, kind)
+
+    def forward(self, x: Float[Tensor, "N C h w"], frames: int) -> Float[Tensor, "N c h2 w2"]:
+        shortcut = x
+        if self.shortcut is not None and self.norm_shortcut is not None:
+            shortcut = _normed(self.norm_shortcut, self.shortcut(x), frames)
+        x = F.relu(_normed(self.norm_1, self.conv_1(x), frames), inplace=True)
+        x = _normed(self.norm_2, self.conv_2(x), frames)
+        return F.relu(x + shortcut, inplace=True)
+
+
+def _norm(channels: int, kind: Norm) -> nn.Module:
+    return norm(channels) if kind == "group" else FrameBatchNorm(channels)
+
+
+def _normed(layer: nn.Module, x: Tensor, frames: int) -> Tensor:
+    return layer.over(x, frames) if isinstance(layer, FrameBatchNorm) else layer(x)
+
+
+class ImageEncoder(nn.Module):
+    """Frames and what the background leaves of them -> features of the cells of discovery.
+
+    Args:
+        image_size: H = W in pixels.
+        grid: G; `image_size` is a multiple of 8 G.
+        widths: channels of the first convolution and of the stages (the first of both is the same).
+        blocks: residual blocks of each stage.
+        outputs: features of a cell.
+        norm: how activations are normalised. `frame`: batch normalisation over the same frame of all videos, as
+            published; `clip`: over all frames of all videos; `group`: GroupNorm, the same for every batch and rank.
+    """
+
+    def __init__(
+        self,
+        image_size: Count,
+        grid: Count = 4,
+        widths: Sequence[Count] = (64, 128, 256),
+        blocks: Sequence[Count] = (2, 2, 2),
+        outputs: Count = 128,
+        norm: Norm = "frame",
+    ) -> None:
+        super().__init__()
+        if image_size % (STRIDE * grid):
+            raise ValueError(f"image_encoder.image_size={image_size} must be a multiple of {STRIDE} x grid={grid}")
+        if len(widths) != 3 or len(blocks) != 3:
+            raise ValueError(f"image_encoder has 3 stages: widths={list(widths)} and blocks={list(blocks)} must say so")
+        self.grid, self.outputs, self.kind = grid, outputs, norm
+        self.conv = nn.Conv2d(6, widths[0], 7, 2, 3, bias=False)
+        self.norm = _norm(widths[0], norm)
+        stages, inputs = [], widths[0]
+        for stage, (width, count) in enumerate(zip(widths, blocks, strict=True)):
+            for block in range(count):
+                stages.append(Residual(inputs, width, 2 if stage > 0 and block == 0 else 1, norm))
+                inputs = width
+        self.stages = nn.ModuleList(stages)
+        self.head = nn.Conv2d(inputs, outputs, 3, image_size // (STRIDE * grid), 1)
+        self._largest = widths[0] * (image_size // 2) ** 2
+        for conv in (m for m in self.stages.modules() if isinstance(m, nn.Conv2d)):
+            nn.init.kaiming_normal_(conv.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, images: Float[Tensor, "B T 6 H W"]) -> Float[Tensor, "B T features G G"]:
+        b, t = images.shape[:2]
+        together = t
+        if self.kind != "clip" or not self.training:  # the frames do not depend on each other
+            together = part_size(t, b * self._largest, images)
+        parts = [self._of(part.flatten(0, 1), part.shape[1]).unflatten(0, (b, -1)) for part in images.split(together, 1)]
+        return joined_over_time(parts)
+
+    def _of(self, x: Tensor, frames: int) -> Tensor:
+        frames = 1 if self.kind == "clip" else frames
+        x = F.relu(_normed(self.norm, self.conv(x), frames), inplace=True)
+        for stage in self.stages:
+            x = stage(x, frames)
+        return self.head(x).float()
+
+
+def joined_over_time(parts: Sequence[Tensor]) -> Tensor:
+    """Parts along dimension 1 -> the whole."""
+    return parts[0] if len(parts) == 1 else torch.cat(list(parts), dim=1)

@@ -1,0 +1,94 @@
+"""From objects to images and masks (gswm.md section 8)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from apex_lab.models.gswm.boxes import paste_window
+from apex_lab.models.gswm.latents import Attributes
+from apex_lab.models.gswm.networks import Decoder
+from apex_lab.nn.parts import joined, part_size
+from apex_lab.nn.spatial_transformer import Paster
+
+IMPORTANCE_GUARD = 1e-5
+
+
+class Drawn(NamedTuple):
+    """N frames, or, as a video's, with (B, T) in place of N.
+
+    masks (N, M, H, W): of the objects; what their sum leaves of 1 is the background's.
+    reconstruction (N, 3, H, W): RGB in [0, 1].
+    means (N, M, 3, H, W): the objects' own images before masking, where asked for.
+    """
+
+    masks: Tensor
+    reconstruction: Tensor
+    means: Tensor | None
+
+
+def compose(
+    pasted: Float[Tensor, "N M 4 H W"], nearness: Float[Tensor, "N M"]
+) -> tuple[Float[Tensor, "N 3 H W"], Float[Tensor, "N M H W"]]:
+    """Masked images and masks of objects, pasted, and sigmoid(-z_depth) -> the foreground and the objects' masks.
+
+    Objects share a pixel by the importance A sigmoid(-z_depth). The images are masked already, so a mask enters once.
+    """
+    alpha = pasted[:, :, 3]
+    importance = alpha * nearness[..., None, None]
+    share = importance / (importance.sum(1, keepdim=True) + IMPORTANCE_GUARD)
+    return torch.einsum("nmhw,nmchw->nchw", share, pasted[:, :, :3]), share * alpha
+
+
+class Renderer(nn.Module):
+    """Decodes objects, pastes them into the image and lays them over the background.
+
+    Args:
+        what: length of z_what.
+        glimpse: side of the decoded glimpses in pixels.
+        widths: channels of the decoder, from the coarsest level to the finest.
+        image_size: H = W in pixels.
+    """
+
+    def __init__(self, what: int, glimpse: int, widths: Sequence[int], image_size: int) -> None:
+        super().__init__()
+        self.decoder = Decoder(what, glimpse, widths, 4, activation=True)
+        self.glimpse, self.image_size = glimpse, image_size
+
+    def forward(
+        self, objects: Attributes, backdrop: Float[Tensor, "N 3 H W"], detail: bool = False
+    ) -> Drawn:
+        """Objects (N, M, ...) of N frames and the background's images -> `Drawn`."""
+        m = objects.what.shape[1]
+        size = part_size(len(backdrop), 4 * m * self.image_size**2, backdrop)
+        split = (part.split(size) for part in objects[:-1])
+        parts = [
+            self._part(Attributes(*values, objects.dyna), behind, detail)
+            for *values, behind in zip(*split, backdrop.split(size), strict=True)
+        ]
+        masks, reconstruction, means = zip(*parts, strict=True)
+        return Drawn(joined(masks), joined(reconstruction), joined(means) if detail else None)
+
+    def _part(self, objects: Attributes, backdrop: Tensor, detail: bool) -> Drawn:
+        glimpses = self.decoder(objects.what.flatten(0, 1)).float().unflatten(0, objects.what.shape[:2])
+        colour, alpha = glimpses.split([3, 1], dim=2)
+        alpha = alpha * objects.pres[..., None, None]
+        paster = Paster(paste_window(objects.where), self.glimpse, self.image_size)
+        pasted = paster.each(torch.cat([alpha * colour, alpha], dim=2))
+        foreground, masks = compose(pasted, torch.sigmoid(-objects.depth[..., 0]))
+        reconstruction = foreground + (1 - masks.sum(1, keepdim=True)) * backdrop
+        return Drawn(masks, reconstruction, paster.each(colour) if detail else None)
+
+
+def negative_log_likelihood(
+    video: Float[Tensor, "B T 3 H W"], mean: Float[Tensor, "B T 3 H W"], sigma: Float[Tensor, ""]
+) -> Float[Tensor, " B"]:
+    """-log N(video; mean, sigma), summed over all pixels, channels and frames; nats."""
+    values = video[0].numel()
+    squares = (video - mean).square().flatten(1).sum(1)
+    return 0.5 * squares / sigma.square() + values * (sigma.log() + 0.5 * math.log(2 * math.pi))
