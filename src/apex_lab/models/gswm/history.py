@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from apex_lab.models.gswm.boxes import enlarged, window_of
-from apex_lab.models.gswm.latents import SHIFT
+from apex_lab.models.gswm.latents import SHIFT, precise
 from apex_lab.models.gswm.networks import Encoder
 from apex_lab.models.gswm.slots import take
 from apex_lab.nn.spatial_transformer import crop
@@ -149,7 +149,7 @@ class Interaction(nn.Module):
         pairs = F.celu(of_row[:, :, :, None] + of_column[:, :, None], inplace=True)
         pairs = F.celu(chain_product(pairs, fused.second, fused.second_bias), inplace=True)
         effects, scores = pairs.split(CHAINS)
-        logits = self.logit_net.layers[-1](scores).squeeze(-1).float()
+        logits = precise(self.logit_net.layers[-1](scores).squeeze(-1))
         if together is not None:
             logits = logits.masked_fill(~together, -torch.inf)
         weights = logits.softmax(-1) * presence[:, None]
@@ -241,6 +241,6 @@ class History(nn.Module):
     def _advance(self, x: Tensor, memory: Memory) -> Memory:
         """An LSTM cell per chain."""
         gates = self.from_input(x) + self.from_hidden(memory.hidden)
-        into, forget, new, out = gates.float().chunk(4, dim=-1)
+        into, forget, new, out = precise(gates).chunk(4, dim=-1)
         cell = torch.sigmoid(forget) * memory.cell + torch.sigmoid(into) * torch.tanh(new)
         return Memory(torch.sigmoid(out) * torch.tanh(cell), cell)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
+from apex_lab.models.gswm.latents import precise
 from apex_lab.models.gswm.networks import norm
 from apex_lab.nn.parts import part_size
 
@@ -135,7 +136,7 @@ class ImageEncoder(nn.Module):
         x = F.relu(_normed(self.norm, self.conv(x), frames), inplace=True)
         for stage in self.stages:
             x = stage(x, frames)
-        return self.head(x).float()
+        return precise(self.head(x))
 
 
 def joined_over_time(parts: Sequence[Tensor]) -> Tensor:

@@ -50,9 +50,14 @@ def attributes(z: Float[Tensor, "... Z"], what: int) -> Attributes:
     return Attributes(*z.split([1, DEPTH, WHERE, what, z.shape[-1] - 1 - DEPTH - WHERE - what], dim=-1))
 
 
+def precise(x: Tensor) -> Tensor:
+    """At least single precision: networks may run in a shorter type, latents and losses do not."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
 def gaussian(raw: Float[Tensor, "... two_D"]) -> Gaussian:
     """A network's output -> mean and standard deviation, softplus(raw) + 1e-4."""
-    mean, spread = raw.float().chunk(2, dim=-1)
+    mean, spread = precise(raw).chunk(2, dim=-1)
     return Gaussian(mean, F.softplus(spread) + MIN_STD)
 
 
@@ -103,8 +108,9 @@ def draw(
         latents: with `mean`, every Gaussian latent is its mean, and presence is its probability (at temperature 1).
     """
     b, t = like.shape[:2]
-    normal = like.new_zeros((b * t, context + (cells + slots) * each), dtype=torch.float32)
-    uniform = like.new_full((b * t, cells + slots + 2), 0.5, dtype=torch.float32)
+    dtype = torch.promote_types(like.dtype, torch.float32)
+    normal = like.new_zeros((b * t, context + (cells + slots) * each), dtype=dtype)
+    uniform = like.new_full((b * t, cells + slots + 2), 0.5, dtype=dtype)
     if latents == "sample":
         source = noise.at(0, t)
         normal, uniform = source.normal(normal), source.uniform(uniform)

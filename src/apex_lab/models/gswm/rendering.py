@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from apex_lab.models.gswm.boxes import paste_window
-from apex_lab.models.gswm.latents import Attributes
+from apex_lab.models.gswm.latents import Attributes, precise
 from apex_lab.models.gswm.networks import Decoder
 from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import Paster
@@ -75,7 +75,7 @@ class Renderer(nn.Module):
         return Drawn(joined(masks), joined(reconstruction), joined(means) if detail else None)
 
     def _part(self, objects: Attributes, backdrop: Tensor, detail: bool) -> Drawn:
-        glimpses = self.decoder(objects.what.flatten(0, 1)).float().unflatten(0, objects.what.shape[:2])
+        glimpses = precise(self.decoder(objects.what.flatten(0, 1))).unflatten(0, objects.what.shape[:2])
         colour, alpha = glimpses.split([3, 1], dim=2)
         alpha = alpha * objects.pres[..., None, None]
         paster = Paster(paste_window(objects.where), self.glimpse, self.image_size)
