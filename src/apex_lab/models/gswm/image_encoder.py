@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from apex_lab.models.gswm.latents import precise
 from apex_lab.models.gswm.networks import norm
-from apex_lab.nn.parts import part_size
+from apex_lab.nn.layout import for_convolutions
+from apex_lab.nn.parts import joined, part_size
 
 Count = Annotated[int, Field(gt=0)]
 Norm = Literal["frame", "clip", "group"]
@@ -23,32 +24,17 @@ STRIDE = 8
 
 
 class FrameBatchNorm(nn.BatchNorm2d):
-    """Batch normalisation with statistics of one frame of all videos, of many frames at once.
+    """Batch normalisation with statistics of one frame of all videos, for many frames at once.
 
-    The published model runs frame by frame, so in training its statistics are those of B images. Here the frames of a
-    video lie side by side as channels, which gives the same numbers, and the same running statistics, in one call.
+    The published model runs frame by frame, so in training its statistics are those of B images. Convolutions rather
+    see many images, so only the norms take the frames apart.
     """
 
     def over(self, images: Float[Tensor, "N C h w"], frames: int) -> Float[Tensor, "N C h w"]:
-        """Images of `frames` frames of every video, videos slowest."""
+        """Images of `frames` frames of every video, frames slowest."""
         if frames == 1 or not self.training:
             return self(images)
-        assert self.running_mean is not None
-        assert self.running_var is not None
-        assert self.num_batches_tracked is not None
-        assert self.momentum is not None
-        side_by_side = images.reshape(len(images) // frames, frames * images.shape[1], *images.shape[2:])
-        mean = torch.zeros_like(self.running_mean).repeat(frames)
-        variance = torch.zeros_like(mean)
-        weight, bias = self.weight.repeat(frames), self.bias.repeat(frames)
-        out = F.batch_norm(side_by_side, mean, variance, weight, bias, True, 1.0, self.eps)
-        with torch.no_grad():
-            age = torch.arange(frames - 1, -1, -1, device=mean.device, dtype=mean.dtype)
-            share = self.momentum * (1 - self.momentum) ** age
-            for running, new in ((self.running_mean, mean), (self.running_var, variance)):
-                running.mul_((1 - self.momentum) ** frames).add_(share @ new.view(frames, -1))
-            self.num_batches_tracked.add_(frames)
-        return out.reshape(images.shape)
+        return torch.cat([self(frame) for frame in images.chunk(frames)])
 
 
 class Residual(nn.Module):
@@ -128,17 +114,13 @@ class ImageEncoder(nn.Module):
         together = t
         if self.kind != "clip" or not self.training:  # the frames do not depend on each other
             together = part_size(t, b * self._largest, images)
-        parts = [self._of(part.flatten(0, 1), part.shape[1]).unflatten(0, (b, -1)) for part in images.split(together, 1)]
-        return joined_over_time(parts)
+        parts = [self._of(part) for part in images.transpose(0, 1).split(together)]
+        return joined(parts).transpose(0, 1)
 
-    def _of(self, x: Tensor, frames: int) -> Tensor:
-        frames = 1 if self.kind == "clip" else frames
-        x = F.relu(_normed(self.norm, self.conv(x), frames), inplace=True)
+    def _of(self, images: Float[Tensor, "T B 6 H W"]) -> Float[Tensor, "T B features G G"]:
+        frames = 1 if self.kind == "clip" else len(images)
+        x = self.conv(for_convolutions(images.flatten(0, 1)))
+        x = F.relu(_normed(self.norm, x, frames), inplace=True)
         for stage in self.stages:
             x = stage(x, frames)
-        return precise(self.head(x))
-
-
-def joined_over_time(parts: Sequence[Tensor]) -> Tensor:
-    """Parts along dimension 1 -> the whole."""
-    return parts[0] if len(parts) == 1 else torch.cat(list(parts), dim=1)
+        return precise(self.head(x)).unflatten(0, images.shape[:2])

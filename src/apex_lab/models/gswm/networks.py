@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.parts import joined, part_size
 
 PER_GROUP = 16
@@ -72,7 +73,7 @@ class Encoder(nn.Module):
 
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N outputs"]:
         parts = images.split(part_size(len(images), self._largest, images))
-        return joined(self.head(self.convs(part).flatten(1)) for part in parts)
+        return joined(self.head(self.convs(for_convolutions(part)).flatten(1)) for part in parts)
 
 
 class Decoder(nn.Module):
