@@ -147,8 +147,8 @@ class Interaction(nn.Module):
         of_column = torch.bmm(torch.cat([columns, columns]).flatten(1, 2), fused.column)
         of_column = of_column.unflatten(1, columns.shape[1:3])
         pairs = F.celu(of_row[:, :, :, None] + of_column[:, :, None], inplace=True)
-        pairs = F.celu(chain_product(pairs, fused.second, fused.second_bias), inplace=True)
-        effects, scores = pairs.split(CHAINS)
+        read = F.celu(torch.baddbmm(fused.second_bias, pairs.flatten(1, -2), fused.second), inplace=True)
+        effects, scores = read.unflatten(1, pairs.shape[1:-1]).split(CHAINS)
         logits = precise(self.logit_net.layers[-1](scores).squeeze(-1))
         if together is not None:
             logits = logits.masked_fill(~together, -torch.inf)

@@ -15,6 +15,9 @@ from apex_lab.nn.parts import joined, part_size
 PER_GROUP = 16
 """Channels of a group in every GroupNorm of the published model."""
 
+SMALL = 32
+"""Side in pixels up to which another memory layout of images costs more than convolutions gain by it."""
+
 
 def norm(channels: int) -> nn.GroupNorm:
     """GroupNorm with groups of 16 channels; narrower layers that are no multiple of 16 get the next best number."""
@@ -72,8 +75,10 @@ class Encoder(nn.Module):
         self._largest = widths[0] * (size // 2) ** 2
 
     def forward(self, images: Float[Tensor, "N 3 size size"]) -> Float[Tensor, "N outputs"]:
+        if images.shape[-1] > SMALL:
+            images = for_convolutions(images)
         parts = images.split(part_size(len(images), self._largest, images))
-        return joined(self.head(self.convs(for_convolutions(part)).flatten(1)) for part in parts)
+        return joined(self.head(self.convs(part).flatten(1)) for part in parts)
 
 
 class Decoder(nn.Module):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from apex_lab.models.gswm.boxes import paste_window
 from apex_lab.models.gswm.latents import Attributes, precise
@@ -32,6 +33,32 @@ class Drawn(NamedTuple):
     means: Tensor | None
 
 
+class _Composition(torch.autograd.Function):
+    """The sums of `compose`, with their gradient written by hand: plain autograd fills and passes many more tensors."""
+
+    @staticmethod
+    def forward(ctx: Any, pasted: Tensor, nearness: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        alpha = pasted[:, :, 3]
+        share = alpha * nearness[..., None, None]
+        total = share.sum(1, keepdim=True).add_(IMPORTANCE_GUARD)
+        share.div_(total)
+        ctx.save_for_backward(pasted, nearness, share, total)
+        return (share[:, :, None] * pasted[:, :, :3]).sum(1), share * alpha
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, on_image: Tensor, on_masks: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        pasted, nearness, share, total = ctx.saved_tensors
+        colour, alpha = pasted[:, :, :3], pasted[:, :, 3]
+        grad = torch.empty_like(pasted)
+        torch.mul(share[:, :, None], on_image[:, None], out=grad[:, :, :3])
+        on_share = (colour * on_image[:, None]).sum(2).addcmul_(on_masks, alpha)
+        on_importance = on_share.sub_((share * on_share).sum(1, keepdim=True)).div_(total)
+        torch.mul(on_masks, share, out=grad[:, :, 3])
+        grad[:, :, 3].addcmul_(on_importance, nearness[..., None, None])
+        return grad, (on_importance * alpha).sum((-2, -1))
+
+
 def compose(
     pasted: Float[Tensor, "N M 4 H W"], nearness: Float[Tensor, "N M"]
 ) -> tuple[Float[Tensor, "N 3 H W"], Float[Tensor, "N M H W"]]:
@@ -39,10 +66,7 @@ def compose(
 
     Objects share a pixel by the importance A sigmoid(-z_depth). The images are masked already, so a mask enters once.
     """
-    alpha = pasted[:, :, 3]
-    importance = alpha * nearness[..., None, None]
-    share = importance / (importance.sum(1, keepdim=True) + IMPORTANCE_GUARD)
-    return torch.einsum("nmhw,nmchw->nchw", share, pasted[:, :, :3]), share * alpha
+    return _Composition.apply(pasted, nearness)
 
 
 class Renderer(nn.Module):
