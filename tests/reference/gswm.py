@@ -11,6 +11,7 @@ numbers belong to slots.
 
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -46,7 +47,7 @@ def copied(target: nn.Module, source: nn.Module) -> nn.Module:
 
 def chain_perceptron(source: Any, chain: int) -> nn.Sequential:
     """One chain's perceptron (or linear layer) out of the model's pair."""
-    layers = list(source.layers) if hasattr(source, "layers") else [source]
+    layers = [source.first, source.second, source.last] if hasattr(source, "first") else [source]
     sizes = [layers[0].weight.shape[1], *(layer.weight.shape[2] for layer in layers)]
     net = perceptron(*sizes)
     with torch.no_grad():
@@ -124,8 +125,6 @@ class Naive(nn.Module):
 
     def __init__(self, model: Gswm) -> None:
         super().__init__()
-        import copy
-
         self.settings = {
             "dropout": model.discovery_dropout,
             "how": model.discovery_draw,
@@ -220,7 +219,9 @@ class Naive(nn.Module):
         more = torch.cat([where[..., :2] + self.settings["margin"], where[..., 2:]], -1)
         return self.env(self.crop(backdrop, more, self.g)).view(b, n, -1)
 
-    def propagate(self, old: dict[str, Tensor], frame: Tensor, eps: Tensor, u: Tensor, tau: Tensor) -> dict[str, Tensor]:
+    def propagate(
+        self, old: dict[str, Tensor], frame: Tensor, eps: Tensor, u: Tensor, tau: Tensor
+    ) -> dict[str, Tensor]:
         b, m = old["ids"].shape
         _, depth, where, what, _ = self.parts(old["z"])
         h_q, h_p = old["h_q"], old["h_p"]
@@ -339,7 +340,9 @@ class Naive(nn.Module):
                 fresh = [cells + s if cells + s in best else fresh.pop(0) for s in range(self.m)]
             rows.append(fresh)
         index = torch.tensor(rows)
-        picked = {name: both[name].gather(1, index[..., None].expand(-1, -1, both[name].shape[-1])) for name in names[:-1]}
+        picked = {
+            name: both[name].gather(1, index[..., None].expand(-1, -1, both[name].shape[-1])) for name in names[:-1]
+        }
         return picked | {"ids": both["ids"].gather(1, index)}
 
     def render(self, z: Tensor, backdrop: Tensor) -> tuple[Tensor, Tensor]:

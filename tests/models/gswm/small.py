@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor, nn
 
@@ -42,10 +43,22 @@ def tiny(norm: Any = "frame", grid: int = 4, background: bool = True, **changes:
         | changes,
     )
     with torch.no_grad():
-        for part in (model.discovery.attribute_head[-1], model.propagation.change_net[-1]):
+        for weight in (p for p in model.parameters() if p.dim() > 1):
+            weight.mul_(1.7)  # signals keep their scale from layer to layer
+        for part, presence in ((model.discovery.attribute_head[-1], -4.0), (model.propagation.change_net[-1], 2.0)):
             assert isinstance(part, nn.Linear | nn.Conv2d)
-            part.weight.mul_(8)
+            assert part.bias is not None
+            part.weight.mul_(3)
+            part.bias[0] = presence
     return model
+
+
+@pytest.fixture
+def double() -> Iterator[None]:
+    """Double precision, in which objects that vanish early or late do so for reasons, not by rounding."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)
 
 
 def video(b: int = 3, t: int = 5, seed: int = 1) -> Tensor:

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import nn
 
-from apex_lab.models.gswm.boxes import cell_centres
 from apex_lab.models.gswm.discovery import Discovery, discovering
 from apex_lab.models.gswm.history import Interaction
 from apex_lab.models.gswm.image_encoder import ImageEncoder
@@ -103,7 +102,11 @@ def test_presence_only_decays_and_the_proposal_is_larger(monkeypatch: pytest.Mon
     monkeypatch.setattr(module, "crop", lambda image, window, size: windows.append(window) or crop(image, window, size))
     z = torch.rand(2, 3, 13)
     after, _ = net(
-        attributes(z, 3), torch.rand(2, 2, 3, 6), torch.rand(2, 3, 16, 16), torch.rand(2, 3, 12), torch.rand(2, 3),
+        attributes(z, 3),
+        torch.rand(2, 2, 3, 6),
+        torch.rand(2, 3, 16, 16),
+        torch.rand(2, 3, 12),
+        torch.rand(2, 3),
         torch.tensor(1.0),
     )
     assert (after.pres <= z[..., :1]).all()
@@ -151,8 +154,9 @@ def test_interaction_reads_pairs() -> None:
     presence = torch.tensor([[0.9, 0.1, 0.5]])
     got = net(phi, phi, presence, None, torch.eye(3, dtype=torch.bool)[None], net.fused())
     for chain in range(2):
+
         def read(mlp: nn.Module, x: torch.Tensor, chain: int = chain) -> torch.Tensor:
-            for i, layer in enumerate(mlp.layers):
+            for i, layer in enumerate((mlp.first, mlp.second, mlp.last)):
                 x = x @ layer.weight[chain] + layer.bias[chain, 0]
                 x = x if i == 2 else nn.functional.celu(x)
             return x
@@ -184,7 +188,9 @@ def test_who_is_kept() -> None:
 
 
 def test_discovered_ones_come_first_on_ties() -> None:
-    kept = keep(torch.tensor([[0.5, 0.2]]), torch.tensor([[0.5, 0.5]]), torch.tensor([[1, 2]]), torch.tensor([9]), 2, None)
+    kept = keep(
+        torch.tensor([[0.5, 0.2]]), torch.tensor([[0.5, 0.5]]), torch.tensor([[1, 2]]), torch.tensor([9]), 2, None
+    )
     assert kept.ids.tolist() == [[1, 9]]
 
 
@@ -202,7 +208,9 @@ def test_take_along_another_dimension() -> None:
 def test_objects_share_pixels_by_importance() -> None:
     """Two objects over one pixel; a mask enters once."""
     alpha = torch.tensor([0.8, 0.4])
-    pasted = torch.cat([(alpha * torch.tensor([1.0, 0.5]))[:, None].expand(2, 3), alpha[:, None]], 1)[None, :, :, None, None]
+    pasted = torch.cat([(alpha * torch.tensor([1.0, 0.5]))[:, None].expand(2, 3), alpha[:, None]], 1)[
+        None, :, :, None, None
+    ]
     near = torch.tensor([[0.25, 0.5]])
     image, masks = compose(pasted, near)
     share = 0.2 / (0.4 + 1e-5)
@@ -263,7 +271,9 @@ def test_norms(norm: str) -> None:
     other_video[1, 0] += 0.5
     frame_matters = not torch.allclose(net(other_frame)[0, 0], base[0, 0], atol=1e-5)
     video_matters = not torch.allclose(net(other_video)[0, 0], base[0, 0], atol=1e-5)
-    assert (frame_matters, video_matters) == {"frame": (False, True), "clip": (True, True), "group": (False, False)}[norm]
+    assert (frame_matters, video_matters) == {"frame": (False, True), "clip": (True, True), "group": (False, False)}[
+        norm
+    ]
 
 
 # which frames discover

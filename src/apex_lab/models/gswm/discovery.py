@@ -132,7 +132,7 @@ def discovering(uniform: Float[Tensor, "B T 2"], dropout: float, how: Draw, firs
         how: see above.
         first: the clip starts with the video's first frame.
     """
-    b, t = uniform.shape[:2]
+    b = len(uniform)
     later = uniform[:, int(first) :, 0]
     always = torch.ones(b, int(first), dtype=torch.bool, device=uniform.device)
     if how == "independent" or later.shape[1] == 0:
@@ -143,5 +143,5 @@ def discovering(uniform: Float[Tensor, "B T 2"], dropout: float, how: Draw, firs
     rank = order.argsort(dim=1)
     one_more = uniform[:, :1, 1] < expected - sure
     mask = torch.cat([always, (rank < sure) | ((rank == sure) & one_more)], dim=1)
-    frames = torch.cat([always.long() * 0, order[:, :most] + int(first)], dim=1)
+    frames = torch.cat([torch.zeros_like(always, dtype=torch.long), order[:, :most] + int(first)], dim=1)
     return Discovering(mask, frames.sort(dim=1).values)

@@ -60,16 +60,15 @@ def chain_product(
 
 
 class ChainMLP(nn.Module):
-    """A perceptron per chain, with CELU between its layers."""
+    """A perceptron of three layers per chain, with CELU between them."""
 
-    def __init__(self, sizes: Sequence[int]) -> None:
+    def __init__(self, inputs: int, hidden: int, outputs: int) -> None:
         super().__init__()
-        self.layers = nn.ModuleList(ChainLinear(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True))
+        self.first, self.second = ChainLinear(inputs, hidden), ChainLinear(hidden, hidden)
+        self.last = ChainLinear(hidden, outputs)
 
     def forward(self, x: Float[Tensor, "two *batch inputs"]) -> Float[Tensor, "two *batch outputs"]:
-        for layer in self.layers[:-1]:
-            x = F.celu(layer(x))
-        return self.layers[-1](x)
+        return self.last(F.celu(self.second(F.celu(self.first(x)))))
 
 
 class Fused(NamedTuple):
@@ -102,9 +101,9 @@ class Interaction(nn.Module):
         super().__init__()
         phi = objects + hidden
         self.phi = phi
-        self.self_net = ChainMLP([phi, hidden, hidden, hidden])
-        self.pair_net = ChainMLP([2 * phi, hidden, hidden, hidden])
-        self.logit_net = ChainMLP([2 * phi, hidden, hidden, 1])
+        self.self_net = ChainMLP(phi, hidden, hidden)
+        self.pair_net = ChainMLP(2 * phi, hidden, hidden)
+        self.logit_net = ChainMLP(2 * phi, hidden, 1)
 
     def fused(self) -> Fused:
         """Arranges the weights for `forward`.
@@ -113,16 +112,16 @@ class Interaction(nn.Module):
         too, and negative for the partner.
         """
         nets = (self.pair_net, self.logit_net)
-        first = torch.cat([net.layers[0].weight for net in nets])
+        first = torch.cat([net.first.weight for net in nets])
         row, column = first.split(self.phi, dim=1)
         before, shift, behind = column.split([SHIFT.start, 2, self.phi - SHIFT.stop], dim=1)
         zeros = torch.zeros_like
         return Fused(
             row + torch.cat([zeros(before), shift, zeros(behind)], dim=1),
-            torch.cat([net.layers[0].bias for net in nets]),
+            torch.cat([net.first.bias for net in nets]),
             torch.cat([before, -shift, behind], dim=1),
-            torch.cat([net.layers[1].weight for net in nets]),
-            torch.cat([net.layers[1].bias for net in nets]),
+            torch.cat([net.second.weight for net in nets]),
+            torch.cat([net.second.bias for net in nets]),
         )
 
     def forward(
@@ -149,15 +148,14 @@ class Interaction(nn.Module):
         pairs = F.celu(of_row[:, :, :, None] + of_column[:, :, None], inplace=True)
         read = F.celu(torch.baddbmm(fused.second_bias, pairs.flatten(1, -2), fused.second), inplace=True)
         effects, scores = read.unflatten(1, pairs.shape[1:-1]).split(CHAINS)
-        logits = precise(self.logit_net.layers[-1](scores).squeeze(-1))
+        logits = precise(self.logit_net.last(scores).squeeze(-1))
         if together is not None:
             logits = logits.masked_fill(~together, -torch.inf)
         weights = logits.softmax(-1) * presence[:, None]
         weights = weights.masked_fill(itself, 0.0)
         weights = weights / (weights.sum(-1, keepdim=True) + WEIGHT_GUARD)
         summed = (weights[..., None, :].to(effects.dtype) @ effects).squeeze(-2)
-        last = self.pair_net.layers[-1]
-        assert isinstance(last, ChainLinear)
+        last = self.pair_net.last
         bias = last.bias[:, None] * weights.sum(-1, keepdim=True)
         acting = torch.bmm(summed.flatten(1, 2), last.weight).unflatten(1, summed.shape[1:3]) + bias
         return self.self_net(rows) + acting
@@ -188,7 +186,9 @@ class History(nn.Module):
         self.hidden, self.margin, self.size = hidden, margin, size
         self.environment = environment
         if environment != "none":
-            self.encoder = Encoder(size, widths, hidden, name="glimpse_size" if environment == "attention" else "image_size")
+            self.encoder = Encoder(
+                size, widths, hidden, name="glimpse_size" if environment == "attention" else "image_size"
+            )
         self.interaction = Interaction(objects, hidden)
         self.input = ChainLinear(objects + 2 * hidden, hidden)
         bound = 1 / math.sqrt(hidden)

@@ -28,7 +28,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Slots(NamedTuple):
-    """The objects kept after a frame: z (B, M, Z), both recurrent states, ids (B, M), and the next new identity (B,)."""
+    """The objects kept after a frame: z (B, M, Z), recurrent states, ids (B, M), and the next new identity (B,)."""
 
     z: Tensor
     memory: Memory
@@ -195,9 +195,7 @@ class Gswm(SceneModel):
         whole = features.new_zeros(*video.shape[:2], *features.shape[2:])
         return whole.scatter(1, index.expand(-1, -1, *features.shape[2:]), features)
 
-    def _roll_out(
-        self, frames: Sequence[Frame], slots: Slots | None, schedule: Schedule
-    ) -> tuple[list[Step], Slots]:
+    def _roll_out(self, frames: Sequence[Frame], slots: Slots | None, schedule: Schedule) -> tuple[list[Step], Slots]:
         """The part that depends on the frame before, frame by frame."""
         fused = self.history.interaction.fused()
         steps = []
@@ -207,9 +205,7 @@ class Gswm(SceneModel):
         assert slots is not None
         return steps, slots
 
-    def _advance(
-        self, frame: Frame, before: Slots | None, fused: Fused, temperature: Tensor
-    ) -> tuple[Step, Slots]:
+    def _advance(self, frame: Frame, before: Slots | None, fused: Fused, temperature: Tensor) -> tuple[Step, Slots]:
         """One frame: propagation, discovery, selection, and the states of the objects kept."""
         b, draws = len(frame.image), frame.draws
         tracked: Attributes | None = None
@@ -248,7 +244,7 @@ class Gswm(SceneModel):
         """Rendering, likelihood, KL and the result: no frame waits for another."""
         b, t = video.shape[:2]
         schedule = context.schedule
-        z, ids, source = (torch.stack([getattr(step, name) for step in steps], dim=1) for name in ("z", "ids", "source"))
+        z, ids, source = (torch.stack(x, dim=1) for x in zip(*(step[:3] for step in steps), strict=True))
         objects = attributes(z, self.what)
         drawn = self.renderer(
             Attributes(*(part.flatten(0, 1) for part in objects)), backdrop.images.flatten(0, 1), context.detail
@@ -267,7 +263,14 @@ class Gswm(SceneModel):
             **{name: torch.where(alone, 0.0, value) for name, value in of_objects.items()},
         }
         return scene_of(
-            objects, ids, source >= self.cells, drawn, backdrop.images, terms, State(backdrop.state, slots), context.detail
+            objects,
+            ids,
+            source >= self.cells,
+            drawn,
+            backdrop.images,
+            terms,
+            State(backdrop.state, slots),
+            context.detail,
         )
 
 
@@ -279,9 +282,7 @@ class BlackBackdrop(NamedTuple):
     state: None
 
 
-def frames_of(
-    video: Tensor, backdrops: Tensor, features: Tensor, draws: Draws, which: Discovering
-) -> list[Frame]:
+def frames_of(video: Tensor, backdrops: Tensor, features: Tensor, draws: Draws, which: Discovering) -> list[Frame]:
     """Video -> frames: takes dimension 1 of everything apart, at once, as autograd likes it."""
     discovers = [None] * video.shape[1] if which.mask is None else list(which.mask.unbind(1))
     of_frames = [Draws(*values) for values in zip(*(x.unbind(1) for x in draws), strict=True)]

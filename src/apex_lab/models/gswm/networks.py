@@ -34,7 +34,7 @@ def conv_stack(channels: int, widths: Sequence[int], first_kernel: int = 3) -> n
 
 
 def shuffle_stack(widths: Sequence[int], outputs: int) -> nn.Sequential:
-    """Sub-pixel convolutions that double the side len(widths) times; CELU and GroupNorm between, a sigmoid at the end."""
+    """Sub-pixel convolutions, each doubles the side; CELU and GroupNorm between them, a sigmoid at the end."""
     layers: list[nn.Module] = []
     for i, (inputs, after) in enumerate(itertools.pairwise([*widths, outputs])):
         layers += [nn.Conv2d(inputs, 4 * after, 3, padding=1), nn.PixelShuffle(2)]

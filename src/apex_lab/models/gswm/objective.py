@@ -14,9 +14,7 @@ from apex_lab.models.gswm.propagation import Propagated, Propagation
 from apex_lab.nn.distributions import Gaussian, kl_gaussian, standard_normal
 
 
-def where_prior(
-    like: Float[Tensor, "... 4"], scale_mean: Float[Tensor, ""], scale_std: float
-) -> Gaussian:
+def where_prior(like: Float[Tensor, "... 4"], scale_mean: Float[Tensor, ""], scale_std: float) -> Gaussian:
     """N((m, m, 0, 0), (v, v, 1, 1)): prior of the raw z_where of a discovery."""
     is_size = torch.arange(WHERE, device=like.device) < 2
     return Gaussian(torch.where(is_size, scale_mean, 0.0), torch.where(is_size, scale_std, 1.0))
@@ -46,7 +44,10 @@ def discovery_terms(
 
 
 def propagation_terms(
-    propagated: Propagated | None, propagation: Propagation, schedule: Mapping[str, Tensor], like: Float[Tensor, "B ..."]
+    propagated: Propagated | None,
+    propagation: Propagation,
+    schedule: Mapping[str, Tensor],
+    like: Float[Tensor, "B ..."],
 ) -> dict[str, Float[Tensor, " B"]]:
     """KL of all propagated slots, present or not; nats. None: no frame had any.
 

@@ -68,9 +68,7 @@ class Propagation(nn.Module):
         motion: how far attributes may change.
     """
 
-    def __init__(
-        self, what: int, dyna: int, hidden: int, glimpse: int, widths: Sequence[int], motion: Motion
-    ) -> None:
+    def __init__(self, what: int, dyna: int, hidden: int, glimpse: int, widths: Sequence[int], motion: Motion) -> None:
         super().__init__()
         self.what, self.glimpse, self.motion = what, glimpse, motion
         self.grow_net = mlp([hidden, hidden, hidden, 2])
@@ -108,9 +106,9 @@ class Propagation(nn.Module):
         prob = torch.sigmoid(chance[..., 0])
         parts = [gaussian(part) for part in rest.split([2 * DEPTH, 2 * WHERE, 2 * self.what], dim=-1)]
         mean, std = (torch.cat(values, dim=-1) for values in zip(*parts, strict=True))
-        after = self.moved(before, mean + std * drawn_rest, torch.sigmoid(gates))
+        depth, where, what = self.moved(before, mean + std * drawn_rest, torch.sigmoid(gates))
         stays = relaxed_bernoulli(prob, temperature, uniform)
-        after = Attributes(before.pres * stays[..., None], *after, dyna)
+        after = Attributes(before.pres * stays[..., None], depth, where, what, dyna)
         return after, Propagated(prob, raw_dyna, p_hidden)
 
     def moved(

@@ -84,17 +84,12 @@ class Renderer(nn.Module):
         self.decoder = Decoder(what, glimpse, widths, 4, activation=True)
         self.glimpse, self.image_size = glimpse, image_size
 
-    def forward(
-        self, objects: Attributes, backdrop: Float[Tensor, "N 3 H W"], detail: bool = False
-    ) -> Drawn:
+    def forward(self, objects: Attributes, backdrop: Float[Tensor, "N 3 H W"], detail: bool = False) -> Drawn:
         """Objects (N, M, ...) of N frames and the background's images -> `Drawn`."""
         m = objects.what.shape[1]
         size = part_size(len(backdrop), 4 * m * self.image_size**2, backdrop)
-        split = (part.split(size) for part in objects[:-1])
-        parts = [
-            self._part(Attributes(*values, objects.dyna), behind, detail)
-            for *values, behind in zip(*split, backdrop.split(size), strict=True)
-        ]
+        split = (Attributes(*part) for part in zip(*(x.split(size) for x in objects), strict=True))
+        parts = [self._part(part, behind, detail) for part, behind in zip(split, backdrop.split(size), strict=True)]
         masks, reconstruction, means = zip(*parts, strict=True)
         return Drawn(joined(masks), joined(reconstruction), joined(means) if detail else None)
 
