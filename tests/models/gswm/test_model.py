@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from torch import Tensor
 
+from apex_lab import components
 from apex_lab.models.gswm import Gswm
 from apex_lab.scene import ABSENT, Scene
 from tests.models.gswm.small import SIZE, context, double, loss, tiny, video
 
 __all__ = ["double"]
+
+CONF = Path(__file__).parents[3] / "conf"
 
 
 def same(a: Scene, b: Scene, atol: float = 1e-4) -> None:
@@ -211,3 +217,18 @@ def test_class_attributes() -> None:
     assert Gswm.needs_training
     assert not Gswm.has_posterior
     assert Gswm.input_size is None
+
+
+@pytest.mark.parametrize(("scale", "size"), [("paper", 128), ("cpu", 64), ("quickstart", 64), ("smoke", 32)])
+def test_recipes_fit_the_model(scale: str, size: int) -> None:
+    """Every scheduled value and loss term has an entry, and the model can be built and run."""
+    nodes = [OmegaConf.load(CONF / f) for f in ("model/gswm.yaml", f"recipe/gswm/{scale}.yaml")]
+    config: Any = OmegaConf.to_container(OmegaConf.merge({"data": {"image_size": size}}, *nodes), resolve=True)
+    components.check(config["model"], "model")
+    model = instantiate(config["model"], _convert_="all").eval()
+    assert set(config["schedule"]) == set(model.schedule_ranges)
+    assert set(config["loss"]) == set(model.term_names)
+    assert config["clips"]["frames"]["values"] == sorted(config["clips"]["frames"]["values"])
+    with torch.no_grad():
+        scene = model(torch.rand(1, 2, 3, size, size), context((0,)))
+    assert scene.masks.shape == (1, 2, model.max_objects + 1, size, size)
