@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from apex_lab.models.scalor.latents import GUARD, full_precision
-from apex_lab.nn.parts import part_size
+from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import Paster
 
 SCALE_GUARD = 1e-9
@@ -18,23 +18,19 @@ SCALE_GUARD = 1e-9
 
 
 class Layers(NamedTuple):
-    """Sums over components at every pixel; sums of disjoint groups of components add up.
+    """Sums over the components of N frames at every pixel.
 
     With alpha_k a component's mask (times its presence), kappa_k = alpha_k sigmoid(-z_depth) its importance and y_k its
     colour times its mask:
 
-    alpha (B, H, W): sum of alpha_k. weight (B, H, W): sum of kappa_k. colour (B, 3, H, W): sum of kappa_k y_k.
-    share (B, H, W): sum of kappa_k alpha_k, without gradient.
+    alpha (N, H, W): sum of alpha_k. weight (N, H, W): sum of kappa_k. colour (N, 3, H, W): sum of kappa_k y_k.
+    share (N, H, W): sum of kappa_k alpha_k, without gradient.
     """
 
     alpha: Tensor
     weight: Tensor
     colour: Tensor
     share: Tensor
-
-    def plus(self, other: Layers) -> Layers:
-        """Sums of both groups."""
-        return Layers(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 def paster_of(windows: Float[Tensor, "*batch 4"], glimpse: int, size: int) -> Paster:
@@ -44,10 +40,11 @@ def paster_of(windows: Float[Tensor, "*batch 4"], glimpse: int, size: int) -> Pa
 
 
 def layers_of(
-    drawn: Float[Tensor, "B K 4 g g"],
-    presence: Float[Tensor, "B K"],
-    depth: Float[Tensor, "B K"],
-    windows: Float[Tensor, "B K 4"],
+    drawn: Float[Tensor, "N K 4 g g"],
+    presence: Float[Tensor, "N K"],
+    depth: Float[Tensor, "N K"],
+    windows: Float[Tensor, "N K 4"],
+    counted: Float[Tensor, "N K"],
     size: int,
 ) -> Layers:
     """Pastes components into images of `size` px and sums them.
@@ -57,26 +54,30 @@ def layers_of(
         presence: z_pres; zero leaves a component out.
         depth: z_depth; larger is farther away.
         windows: (s_y, s_x, t_y, t_x).
+        counted: weight of a component's mask in `Layers.alpha`: 1, or 0 to leave it out there.
         size: H = W in pixels.
     """
     with full_precision(drawn):
         nearness = torch.sigmoid(-depth.float())
-        each = part_size(drawn.shape[1], 4 * size * size * len(drawn), drawn)
-        groups = zip(*(x.split(each, dim=1) for x in (drawn, presence, nearness, windows)), strict=True)
-        first, *others = (_layers_of_part(*group, size) for group in groups)
-        for other in others:
-            first = first.plus(other)
-        return first
+        each = part_size(len(drawn), 4 * size * size * drawn.shape[1], drawn)
+        inputs = zip(*(x.split(each) for x in (drawn, presence, nearness, windows, counted)), strict=True)
+        parts = [_layers_of_part(*part, size) for part in inputs]
+        return Layers(*(joined(sums) for sums in zip(*parts, strict=True)))
 
 
-def _layers_of_part(drawn: Tensor, presence: Tensor, nearness: Tensor, windows: Tensor, size: int) -> Layers:
+def _layers_of_part(
+    drawn: Tensor, presence: Tensor, nearness: Tensor, windows: Tensor, counted: Tensor, size: int
+) -> Layers:
     drawn = drawn.float()
     alpha = drawn[:, :, 3:] * presence[..., None, None, None]
     maps = paster_of(windows, drawn.shape[-1], size).each(torch.cat([drawn[:, :, :3] * alpha, alpha], dim=2))
-    colour, mask = maps[:, :, :3], maps[:, :, 3]
-    importance = nearness[..., None, None] * mask
-    share = (importance.detach() * mask.detach()).sum(1)
-    return Layers(mask.sum(1), importance.sum(1), (importance[:, :, None] * colour).sum(1), share)
+    mask = maps[:, :, 3:]
+    # Sums over components as products of matrices: no weighted copy of the maps is made.
+    sums = torch.stack([counted, nearness], dim=1) @ mask.flatten(2)
+    products = nearness[:, None] @ (maps * mask).flatten(2)
+    alpha_sum, weight = sums.unflatten(-1, (size, size)).unbind(1)
+    colour, share = products.reshape(-1, 4, size, size).split([3, 1], dim=1)
+    return Layers(alpha_sum, weight, colour, share.squeeze(1).detach())
 
 
 class _ClampThrough(torch.autograd.Function):

@@ -107,18 +107,21 @@ class GlimpseDecoder(nn.Module):
             return nn.Sequential(*same(16, 8), nn.Conv2d(8, outputs, 3, padding=1))
         return nn.Sequential(nn.Conv2d(16, outputs, 3, padding=1))
 
-    def forward(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch 4 g g"]:
-        """Channels: o (RGB), alpha."""
+    def forward(
+        self, what: Float[Tensor, "*batch Z"], alpha_only: bool = False
+    ) -> Float[Tensor, "*batch C g g"]:
+        """Channels: o (RGB), alpha; or alpha alone."""
         flat = what.reshape(-1, what.shape[-1])
         size = part_size(len(flat), 16 * self.size**2, flat)
-        drawn = joined(self._decode(part) for part in flat.split(size))
+        drawn = joined(self._decode(part, alpha_only) for part in flat.split(size))
         return drawn.reshape(*what.shape[:-1], *drawn.shape[1:])
 
-    def _decode(self, what: Float[Tensor, "N Z"]) -> Float[Tensor, "N 4 g g"]:
-        return torch.sigmoid(self._heads(self.trunk(what[..., None, None])))
+    def _decode(self, what: Float[Tensor, "N Z"], alpha_only: bool) -> Float[Tensor, "N C g g"]:
+        features = self.trunk(what[..., None, None])
+        return torch.sigmoid(self.alpha(features) if alpha_only else self._heads(features))
 
     def _heads(self, features: Tensor) -> Tensor:
-        """Both heads as one network: their hidden layers side by side, their last layers block by block."""
+        """Both heads as one network, their hidden layers side by side."""
         heads = (self.colour, self.alpha)
         if not self.deep_heads:
             return self._together(features, *(head[0] for head in heads))

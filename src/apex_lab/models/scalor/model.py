@@ -128,18 +128,18 @@ class Scalor(SceneModel):
         before: State | None = context.state
         noise = context.noise if self.training or self.latents == "samples" else None
         features, memory = self.encoder(video, None if before is None else before.memory)
-        steps, layers, slots = self.objects(
+        steps, slots = self.objects(
             video, features, None if before is None else before.slots, noise, context.schedule
         )
-        summed = Layers(*(torch.stack(sums, dim=1) for sums in zip(*layers, strict=True)))
+        layers = self.objects.render(steps, context.schedule)
         with full_precision(video):
-            rendered, background, terms = self._render(video, summed, before, noise)
+            rendered, background, terms = self._render(video, layers, before, noise)
             terms |= added(
                 discovery_terms(steps, context.schedule["discovery_presence"]),
                 propagation_terms(steps, self.objects.propagation.prior),
             )
         state = _detached(State(memory, slots, background))
-        return self._scene(steps, summed, rendered, terms, state, context.detail)
+        return self._scene(steps, layers, rendered, terms, state, context.detail)
 
     def _render(
         self, video: Tensor, layers: Layers, before: State | None, noise: Noise | None
@@ -170,7 +170,7 @@ class Scalor(SceneModel):
         self, steps: list[Step], layers: Layers, rendered: Rendered, terms: Terms, state: State, detail: bool
     ) -> Scene:
         """The P objects that are kept after each frame, and the background, last."""
-        frames = [Frame(step, colours=detail) for step in steps]
+        frames = [Frame(step) for step in steps]
         with full_precision(rendered.image):
             masks = torch.stack(
                 [
@@ -182,7 +182,11 @@ class Scalor(SceneModel):
             means = None
             if detail:
                 means = torch.stack(
-                    [frame_means(frame, rendered.backdrop[:, t]) for t, frame in enumerate(frames)], dim=1
+                    [
+                        frame_means(frame, self.objects.glimpse_decoder(frame.what)[:, :, :3], rendered.backdrop[:, t])
+                        for t, frame in enumerate(frames)
+                    ],
+                    dim=1,
                 )
         kept = torch.stack([step.kept for step in steps], dim=1)
         ids = torch.stack([step.ids for step in steps], dim=1)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from apex_lab.models.scalor.composition import Layers, paster_of
 from apex_lab.models.scalor.latents import GUARD
-from apex_lab.models.scalor.rollout import Step
+from apex_lab.models.scalor.rollout import Step, joined_candidates
 from apex_lab.models.scalor.windows import window_of
 from apex_lab.nn.parts import part_size
 
@@ -22,16 +22,9 @@ FAINT = 0.3
 """The original's overlay is shown where the foreground's mask is above this."""
 
 
-def _candidates(step: Step, propagated: Tensor | None, found: Tensor) -> Tensor:
-    """(B, P, ...) and (B, D, ...) -> (B, P + D, ...); zeros for the P slots of a video's first frame."""
-    if propagated is None:
-        propagated = found.new_zeros(*step.alive.shape, *found.shape[2:])
-    return torch.cat([propagated, found], dim=1)
-
-
 def held(step: Step, propagated: Tensor | None, found: Tensor) -> Tensor:
     """Values of the candidates that the P slots hold after the frame, (B, P, ...); zero where they hold nothing."""
-    values = _candidates(step, propagated, found)
+    values = joined_candidates(step, propagated, found)
     kept = step.kept.reshape(*step.kept.shape, *([1] * (values.dim() - 2)))
     source = step.source.reshape(*step.source.shape, *([1] * (values.dim() - 2)))
     return values.gather(1, source.expand(-1, -1, *values.shape[2:])) * kept
@@ -40,11 +33,10 @@ def held(step: Step, propagated: Tensor | None, found: Tensor) -> Tensor:
 class Frame:
     """The P kept objects of one frame, without gradients.
 
-    what (B, P, Z), windows (B, P, 4) as (s_y, s_x, t_y, t_x), presence, depth (B, P), drawn (B, P, C, g, g): alpha, after o
-    (RGB) if `colours`.
+    what (B, P, Z), windows (B, P, 4) as (s_y, s_x, t_y, t_x), presence, depth (B, P), alpha (B, P, g, g).
     """
 
-    def __init__(self, step: Step, colours: bool) -> None:
+    def __init__(self, step: Step) -> None:
         before, found = step.propagated, step.proposals
         objects = None if before is None else before.objects
 
@@ -54,9 +46,7 @@ class Frame:
         self.what, self.windows, self.depth = pick("what"), window_of(pick("where")), pick("depth").squeeze(-1)
         presence = None if objects is None else objects.presence.squeeze(-1)
         self.presence = held(step, presence, step.found).detach()
-        first = 0 if colours else 3
-        drawn = None if step.drawn is None else step.drawn[:, :, first:].detach()
-        self.drawn = held(step, drawn, step.drawn_found[:, :, first:].detach())
+        self.alpha = held(step, None if step.drawn is None else step.drawn[:, :, -1], step.drawn_found[:, :, -1])
         self.kept = step.kept
 
 
@@ -77,13 +67,13 @@ def frame_masks(
             most 0.3, else the component with the largest w_k.
     """
     size = foreground.shape[-1]
-    each = part_size(frame.drawn.shape[1], size * size * len(foreground), foreground)
+    each = part_size(frame.alpha.shape[1], size * size * len(foreground), foreground)
     objects = []
-    for drawn, windows, presence, depth in zip(
-        *(x.split(each, dim=1) for x in (frame.drawn, frame.windows, frame.presence, frame.depth)), strict=True
+    for alpha, windows, presence, depth in zip(
+        *(x.split(each, dim=1) for x in (frame.alpha, frame.windows, frame.presence, frame.depth)), strict=True
     ):
-        alpha = drawn[:, :, -1:].float() * presence[..., None, None, None]
-        mask = paster_of(windows, drawn.shape[-1], size).each(alpha).squeeze(2)
+        present = alpha.float() * presence[..., None, None]
+        mask = paster_of(windows, alpha.shape[-1], size).each(present[:, :, None]).squeeze(2)
         importance = torch.sigmoid(-depth.float())[..., None, None] * mask
         objects.append(importance * mask if readout == "rendering" else importance)
     masks = torch.cat(objects, dim=1)
@@ -100,9 +90,11 @@ def frame_masks(
     return torch.cat([masks, (1 - masks.sum(1, keepdim=True)).clamp_min(0)], dim=1)
 
 
-def frame_means(frame: Frame, backdrop: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B P_plus_1 3 H W"]:
+def frame_means(
+    frame: Frame, colour: Float[Tensor, "B P 3 g g"], backdrop: Float[Tensor, "B 3 H W"]
+) -> Float[Tensor, "B P_plus_1 3 H W"]:
     """Each kept object's own image, black outside of its window, and the background's."""
-    pasted = paster_of(frame.windows, frame.drawn.shape[-1], backdrop.shape[-1]).each(frame.drawn[:, :, :3].float())
+    pasted = paster_of(frame.windows, colour.shape[-1], backdrop.shape[-1]).each(colour.float())
     return torch.cat([pasted * frame.kept[..., None, None, None], backdrop[:, None]], dim=1).clamp(0, 1)
 
 

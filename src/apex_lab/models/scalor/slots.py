@@ -82,6 +82,19 @@ def strongest(presence: Float[Tensor, "B D"], count: Int[Tensor, " B"]) -> Bool[
     return (presence > limit) | (count >= d)[:, None]
 
 
+def pack(chosen: Bool[Tensor, "B K"], slots: int) -> tuple[Int[Tensor, "B P"], Bool[Tensor, "B P"]]:
+    """Indices of the first `slots` chosen candidates, in order, and which of them there are (the first ones).
+
+    Where there is none the index is arbitrary.
+    """
+    place = chosen.cumsum(1) - 1
+    place = torch.where(chosen & (place < slots), place, slots)  # column `slots` takes all others
+    candidate = torch.arange(chosen.shape[1], device=chosen.device).expand_as(place)
+    source = place.new_zeros(len(place), slots + 1).scatter(1, place, candidate)[:, :slots]
+    valid = torch.arange(slots, device=chosen.device) < chosen.sum(1, keepdim=True)
+    return source, valid
+
+
 def keep(
     stays: Bool[Tensor, "B P"],
     arrives: Bool[Tensor, "B D"],
@@ -96,13 +109,7 @@ def keep(
         ids: of the propagated objects.
         next_id: per video.
     """
-    slots = ids.shape[1]
-    kept = torch.cat([stays, arrives], dim=1)
-    place = kept.cumsum(1) - 1
-    place = torch.where(kept & (place < slots), place, slots)  # column P takes all that is not kept
-    candidate = torch.arange(kept.shape[1], device=kept.device).expand_as(place)
-    source = torch.zeros_like(place[:, : slots + 1]).scatter(1, place, candidate)[:, :slots]
-    valid = torch.arange(slots, device=kept.device) < kept.sum(1, keepdim=True)
+    source, valid = pack(torch.cat([stays, arrives], dim=1), ids.shape[1])
     fresh = next_id[:, None] + arrives.cumsum(1) - 1
     given = torch.cat([ids, fresh], dim=1).gather(1, source)
     return Kept(source, valid, given.masked_fill(~valid, ABSENT), next_id + arrives.sum(1))
@@ -118,7 +125,11 @@ def carry(candidates: tuple[Objects, Objects], kept: Kept, flow: Float[Tensor, "
     """
     sizes = [x.shape[-1] for x in candidates[0]]
     whole = torch.cat([torch.cat(group, dim=-1) for group in candidates], dim=1)
-    picked = whole.gather(1, kept.source[..., None].expand(-1, -1, whole.shape[-1]))
-    picked = picked * kept.valid[..., None]
+    picked = taken(whole, kept.source) * kept.valid[..., None]
     picked = torch.where(flow > 0.5, picked, picked.detach())
     return Objects(*picked.split(sizes, dim=-1))
+
+
+def taken(values: Float[Tensor, "*batch K D"], source: Int[Tensor, "*batch P"]) -> Float[Tensor, "*batch P D"]:
+    """Rows of `values` at `source`."""
+    return values.gather(-2, source[..., None].expand(*source.shape, values.shape[-1]))
