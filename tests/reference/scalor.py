@@ -48,6 +48,18 @@ def put(glimpse: Tensor, where: Tensor, height: int, width: int) -> Tensor:
     return F.grid_sample(glimpse, grid, align_corners=False)
 
 
+def plain(layers: nn.Module, x: Tensor) -> Tensor:
+    """Layers one by one in PyTorch's default memory layout, nothing in place."""
+    for layer in layers.children() if isinstance(layers, nn.Sequential) else [layers]:
+        if isinstance(layer, nn.PixelShuffle):
+            x = F.pixel_shuffle(x, layer.upscale_factor)
+        elif isinstance(layer, nn.CELU):
+            x = F.celu(x)
+        else:
+            x = layer(x)
+    return x
+
+
 def normal_kl(m: Tensor, s: Tensor, pm: Tensor, ps: Tensor) -> Tensor:
     q, p = torch.distributions.Normal(m, s), torch.distributions.Normal(pm, ps)
     return torch.distributions.kl_divergence(q, p)
@@ -82,8 +94,8 @@ class NaiveScalor(nn.Module):
         c = [torch.zeros_like(x) for x in h]
         features = []
         for t in range(video.shape[1]):
-            u = net.image.stack(video[:, t])
-            x = net.image.fuse(torch.cat([u, net.image.lateral(u)], 1))
+            u = plain(net.image.stack, video[:, t])
+            x = plain(net.image.fuse, torch.cat([u, plain(net.image.lateral, u)], 1))
             for i, layer in enumerate(net.memory):
                 xi, xf, xo, xg = layer.from_input(x).chunk(4, 1)
                 hi, hf, ho, hg = layer.from_hidden(h[i]).chunk(4, 1)
@@ -101,13 +113,13 @@ class NaiveScalor(nn.Module):
         net, g = self.model.objects.glimpse_encoder, self.model.objects.glimpse_encoder.size
         each = len(where) // len(image)
         crops = cut(image.repeat_interleave(each, 0), where, g, g)
-        mean, raw = net.head(net.stack(crops).flatten(1)).chunk(2, -1)
+        mean, raw = net.head(plain(net.stack, crops).flatten(1)).chunk(2, -1)
         return mean, F.softplus(raw)
 
     def decode(self, what: Tensor) -> tuple[Tensor, Tensor]:
         net = self.model.objects.glimpse_decoder
-        features = net.trunk(what[:, :, None, None])
-        return torch.sigmoid(net.colour(features)), torch.sigmoid(net.alpha(features))
+        features = plain(net.trunk, what[:, :, None, None])
+        return torch.sigmoid(plain(net.colour, features)), torch.sigmoid(plain(net.alpha, features))
 
     def forward(self, video: Tensor, schedule: Mapping[str, Tensor], noise: Noise) -> Result:
         model, nets = self.model, self.model.objects
@@ -158,7 +170,7 @@ class NaiveScalor(nn.Module):
         hidden, last = torch.zeros(b, model.background.prior_rnn.hidden_size), None
         for t, (image, a, fore) in enumerate(layers):
             net = model.background
-            mean, raw = net.encoder(torch.cat([image, 1 - a], 1)).flatten(1).chunk(2, 1)
+            mean, raw = plain(net.encoder, torch.cat([image, 1 - a], 1)).flatten(1).chunk(2, 1)
             std = F.softplus(raw)
             z = mean + std * noise.at(t).normal(mean)
             if last is None:
@@ -169,7 +181,7 @@ class NaiveScalor(nn.Module):
                 pm, ps = last + delta, F.softplus(praw)
             last = z
             totals["kl_background"] = totals["kl_background"] + normal_kl(mean, std, pm, ps).sum(1)
-            picture = fore + (1 - a) * torch.sigmoid(net.decoder(z[:, :, None, None]))
+            picture = fore + (1 - a) * torch.sigmoid(plain(net.decoder, z[:, :, None, None]))
             log_p = torch.distributions.Normal(picture, model.sigma).log_prob(image)
             totals["nll"] = totals["nll"] - log_p.sum((1, 2, 3))
             images.append(picture)
@@ -199,7 +211,7 @@ class NaiveScalor(nn.Module):
         around = torch.cat([half, before["where"][:, 2:].detach()], 1)
         small = feature.shape[-1] // 2
         seen = cut(feature.repeat_interleave(n, 0), around, small, small)
-        f = net.attention_code(net.attention(seen).flatten(1))
+        f = net.attention_code(plain(net.attention, seen).flatten(1))
         inputs = [before[k] for k in ("where", "presence", "what", "raw")]
         h = net.tracker(net.tracker_input(torch.cat([*inputs, f], 1)), before["tracker"])
 
@@ -277,10 +289,10 @@ class NaiveScalor(nn.Module):
     ) -> dict[str, Tensor]:
         net, b = self.model.objects.discovery, len(image)
         g = net.grid
-        q = net.fusion(torch.cat([feature, net.mask_encoder(explained)], 1))
+        q = plain(net.fusion, torch.cat([feature, plain(net.mask_encoder, explained)], 1))
 
         def per_cell(head: nn.Module) -> Tensor:
-            return head(q).permute(0, 2, 3, 1).flatten(0, 2)
+            return plain(head, q).permute(0, 2, 3, 1).flatten(0, 2)
 
         def normal(width: int) -> Tensor:
             return noise.normal(torch.zeros(b, g * g, width)).flatten(0, 1)

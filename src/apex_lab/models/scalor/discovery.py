@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from apex_lab.models.scalor.blocks import halved, halvings, same
+from apex_lab.models.scalor.blocks import halved, halvings, laid_out, same
 from apex_lab.models.scalor.composition import paster_of
 from apex_lab.models.scalor.encoder import FEATURES
 from apex_lab.models.scalor.glimpses import GlimpseEncoder
@@ -95,7 +95,7 @@ class Discovery(nn.Module):
         recompute: Recompute,
     ) -> Proposals:
         """Proposals of all cells; no gradient goes to `explained`."""
-        code = self.mask_encoder(explained.detach()[:, None])
+        code = self.mask_encoder(laid_out(explained.detach()[:, None]))
         q = self.fusion(torch.cat([features, code], dim=1))
 
         def cells(head: nn.Module) -> Float[Tensor, "B D outputs"]:

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.models.scalor.blocks import halved, halvings, same
+from apex_lab.models.scalor.blocks import halved, halvings, laid_out, same
 
 FEATURES = 64
 """Channels of e_t."""
@@ -47,7 +47,7 @@ class ImageEncoder(nn.Module):
         self.fuse = nn.Sequential(*same(2 * FEATURES, FEATURES))
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 64 G G"]:
-        u = self.stack(images)
+        u = self.stack(laid_out(images))
         return self.fuse(torch.cat([u, self.lateral(u)], dim=1))
 
 
