@@ -8,7 +8,6 @@ runs only the stacks of layers; sizes of its draws are those of the model, so th
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -124,7 +123,6 @@ class NaiveScalor(nn.Module):
     def forward(self, video: Tensor, schedule: Mapping[str, Tensor], noise: Noise) -> Result:
         model, nets = self.model, self.model.objects
         b, t_max, _, size, _ = video.shape
-        cells = nets.discovery.grid**2
         p_max = nets.max_objects if model.training else nets.evaluation_objects
         features = self.encode_video(video)
         totals = {name: torch.zeros(b) for name in model.term_names}
@@ -198,7 +196,7 @@ class NaiveScalor(nn.Module):
         totals: dict[str, Tensor],
         p_max: int,
     ) -> dict[str, Tensor]:
-        model, net = self.model, self.model.objects.propagation
+        net = self.model.objects.propagation
         b, n = state["presence"].shape[:2]
         what_size = state["what"].shape[-1]
 

@@ -42,7 +42,9 @@ def clip(videos: int = 2, frames: int = 4, size: int = 32, seed: int = 0) -> Ten
     return video
 
 
-def run(model: Scalor, video: Tensor, names: list[int] | None = None, state: Any = None, first: int = 0, **kw: Any) -> Scene:
+def run(
+    model: Scalor, video: Tensor, names: list[int] | None = None, state: Any = None, first: int = 0, **kw: Any
+) -> Scene:
     """A pass with noise that is a function of video and frame."""
     detail = kw.pop("detail", False)
     noise = VideoNoise(0, names or list(range(len(video))), first)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -17,6 +18,11 @@ from tests.reference.scalor import NaiveScalor, Result
 def twin(model: Scalor, video: torch.Tensor, **schedule: float) -> Result:
     noise = VideoNoise(0, list(range(len(video))))
     return NaiveScalor(model)(video, schedule_at({**SCHEDULE, **schedule}), noise)
+
+
+def named(name: str) -> Callable[[str], str]:
+    """Message of a failed comparison, with the name of what was compared."""
+    return lambda message: f"{name}: {message}"
 
 
 def gradients(model: Scalor, terms: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
@@ -40,7 +46,7 @@ def test_same_terms_masks_and_gradients(arguments: dict[str, Any], schedule: dic
     got, want = run(model, video, **schedule), twin(model, video, **schedule)
     assert max(len(frame) for row in want.masks for frame in row) > 2, "the example should have objects"
     for name in model.term_names:
-        torch.testing.assert_close(got.terms[name], want.terms[name], rtol=1e-4, atol=1e-2, msg=lambda m, name=name: f"{name}: {m}")
+        torch.testing.assert_close(got.terms[name], want.terms[name], rtol=1e-4, atol=1e-2, msg=named(name))
     torch.testing.assert_close(got.reconstruction, want.reconstruction, rtol=0, atol=1e-3)
     for i, row in enumerate(want.masks):
         for t, frame in enumerate(row):
@@ -51,7 +57,7 @@ def test_same_terms_masks_and_gradients(arguments: dict[str, Any], schedule: dic
     ours, theirs = gradients(model, got.terms), gradients(model, want.terms)
     for name, gradient in theirs.items():
         scale = float(gradient.abs().max()) + 1e-3
-        torch.testing.assert_close(ours[name], gradient, rtol=0, atol=5e-3 * scale, msg=lambda m, name=name: f"{name}: {m}")
+        torch.testing.assert_close(ours[name], gradient, rtol=0, atol=5e-3 * scale, msg=named(name))
 
 
 def test_same_in_evaluation() -> None:
@@ -60,7 +66,7 @@ def test_same_in_evaluation() -> None:
     with torch.no_grad():
         got, want = run(model, video), twin(model, video)
     for name in model.term_names:
-        torch.testing.assert_close(got.terms[name], want.terms[name], rtol=1e-4, atol=1e-2, msg=lambda m, name=name: f"{name}: {m}")
+        torch.testing.assert_close(got.terms[name], want.terms[name], rtol=1e-4, atol=1e-2, msg=named(name))
     for i, row in enumerate(want.masks):
         for t, frame in enumerate(row):
             assert sorted(k for k in got.ids[i, t].tolist() if k >= 0) == sorted(frame)

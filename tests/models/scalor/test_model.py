@@ -32,7 +32,7 @@ def test_scene(training: bool) -> None:
     torch.testing.assert_close(scene.masks.sum(2), torch.ones(2, 3, 32, 32))
     assert 0 <= float(scene.masks.min()) <= float(scene.masks.max()) <= 1
     assert scene.background.tolist() == [False] * 6 + [True]
-    assert tuple(scene.terms) and set(scene.terms) == set(model.term_names)
+    assert set(scene.terms) == set(model.term_names)
     assert all(term.shape == (2,) and bool(torch.isfinite(term).all()) for term in scene.terms.values())
     absent = scene.ids == ABSENT
     assert bool((~absent[..., :-1]).any())

@@ -60,13 +60,13 @@ def layers_of(
     with full_precision(drawn):
         nearness = torch.sigmoid(-depth.float())
         each = part_size(len(drawn), 4 * size * size * drawn.shape[1], drawn)
-        inputs = zip(*(x.split(each) for x in (drawn, presence, nearness, windows, counted)), strict=True)
-        parts = [_layers_of_part(*part, size) for part in inputs]
+        inputs = [x.split(each) for x in (drawn, presence, nearness, windows, counted)]
+        parts = [_layers_of_part(size, *part) for part in zip(*inputs, strict=True)]
         return Layers(*(joined(sums) for sums in zip(*parts, strict=True)))
 
 
 def _layers_of_part(
-    drawn: Tensor, presence: Tensor, nearness: Tensor, windows: Tensor, counted: Tensor, size: int
+    size: int, drawn: Tensor, presence: Tensor, nearness: Tensor, windows: Tensor, counted: Tensor
 ) -> Layers:
     drawn = drawn.float()
     alpha = drawn[:, :, 3:] * presence[..., None, None, None]

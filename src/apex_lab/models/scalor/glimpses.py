@@ -9,7 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.models.scalor.blocks import enlarged, halved, laid_out, same
+from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, laid_out, same
 from apex_lab.models.scalor.latents import full_precision
 from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import crop
@@ -61,9 +61,7 @@ class GlimpseEncoder(nn.Module):
         with full_precision(images):
             return crop(images, windows, self.size).flatten(0, 1)
 
-    def forward(
-        self, images: Float[Tensor, "B 3 H W"], windows: Float[Tensor, "B K 4"]
-    ) -> Float[Tensor, "B K two_Z"]:
+    def forward(self, images: Float[Tensor, "B 3 H W"], windows: Float[Tensor, "B K 4"]) -> Float[Tensor, "B K two_Z"]:
         """Cuts windows (s_y, s_x, t_y, t_x) out of images and encodes them."""
         count = windows.shape[1]
         size = part_size(len(images), count * 16 * (self.size // 2) ** 2, images)
@@ -87,7 +85,7 @@ class GlimpseDecoder(nn.Module):
 
     def __init__(self, size: int, what: int, deep_heads: bool) -> None:
         super().__init__()
-        self.size, self.deep_heads = size, deep_heads
+        self.size = size
         layers = [*same(what, 128, kernel=1), *enlarged(128, 64, 4)]
         if _doublings(size) == 4:
             layers += [*same(64, 64), *enlarged(64, 64, 4), *same(64, 64), *enlarged(64, 32, 2)]
@@ -100,16 +98,9 @@ class GlimpseDecoder(nn.Module):
                 channels = width
             layers += same(16, 16)
         self.trunk = nn.Sequential(*layers)
-        self.colour, self.alpha = self._head(3), self._head(1)
+        self.colour, self.alpha = Head(3, deep_heads), Head(1, deep_heads)
 
-    def _head(self, outputs: int) -> nn.Sequential:
-        if self.deep_heads:
-            return nn.Sequential(*same(16, 8), nn.Conv2d(8, outputs, 3, padding=1))
-        return nn.Sequential(nn.Conv2d(16, outputs, 3, padding=1))
-
-    def forward(
-        self, what: Float[Tensor, "*batch Z"], alpha_only: bool = False
-    ) -> Float[Tensor, "*batch C g g"]:
+    def forward(self, what: Float[Tensor, "*batch Z"], alpha_only: bool = False) -> Float[Tensor, "*batch C g g"]:
         """Channels: o (RGB), alpha; or alpha alone."""
         flat = what.reshape(-1, what.shape[-1])
         size = part_size(len(flat), 16 * self.size**2, flat)
@@ -122,23 +113,38 @@ class GlimpseDecoder(nn.Module):
 
     def _heads(self, features: Tensor) -> Tensor:
         """Both heads as one network, their hidden layers side by side."""
-        heads = (self.colour, self.alpha)
-        if not self.deep_heads:
-            return self._together(features, *(head[0] for head in heads))
-        hidden = F.celu_(self._together(features, *(head[0] for head in heads)))
-        norms = [head[2] for head in heads]
-        hidden = F.group_norm(
-            hidden,
-            sum(norm.num_groups for norm in norms),
-            torch.cat([norm.weight for norm in norms]),
-            torch.cat([norm.bias for norm in norms]),
-            norms[0].eps,
-        )
+        a, b = self.colour, self.alpha
+        if a.hidden is None or a.norm is None or b.hidden is None or b.norm is None:
+            return _together(features, a.out, b.out)
+        hidden = F.celu_(_together(features, a.hidden, b.hidden))
+        weight, bias = (torch.cat([getattr(a.norm, name), getattr(b.norm, name)]) for name in ("weight", "bias"))
+        hidden = F.group_norm(hidden, a.norm.num_groups + b.norm.num_groups, weight, bias, a.norm.eps)
         colour, alpha = hidden.chunk(2, dim=1)
-        return torch.cat([self.colour[3](colour), self.alpha[3](alpha)], dim=1)
+        return torch.cat([a.out(colour), b.out(alpha)], dim=1)
 
-    @staticmethod
-    def _together(x: Tensor, *convs: nn.Conv2d) -> Tensor:
-        """Convolutions of the same input as one."""
-        biases = [conv.bias for conv in convs if conv.bias is not None]
-        return F.conv2d(x, torch.cat([conv.weight for conv in convs]), torch.cat(biases), padding=1)
+
+class Head(nn.Module):
+    """Last layers of the glimpse decoder, for one of its outputs.
+
+    Args:
+        outputs: channels.
+        deep: with a hidden layer.
+    """
+
+    def __init__(self, outputs: int, deep: bool) -> None:
+        super().__init__()
+        self.hidden = nn.Conv2d(16, 8, 3, padding=1) if deep else None
+        self.norm = nn.GroupNorm(GROUPS[8], 8) if deep else None
+        self.out = nn.Conv2d(8 if deep else 16, outputs, 3, padding=1)
+
+    def forward(self, features: Float[Tensor, "N 16 g g"]) -> Float[Tensor, "N outputs g g"]:
+        if self.hidden is not None and self.norm is not None:
+            features = self.norm(F.celu_(self.hidden(features)))
+        return self.out(features)
+
+
+def _together(x: Tensor, a: nn.Conv2d, b: nn.Conv2d) -> Tensor:
+    """Two convolutions of the same input as one."""
+    assert a.bias is not None
+    assert b.bias is not None
+    return F.conv2d(x, torch.cat([a.weight, b.weight]), torch.cat([a.bias, b.bias]), padding=1)

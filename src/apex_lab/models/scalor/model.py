@@ -128,9 +128,7 @@ class Scalor(SceneModel):
         before: State | None = context.state
         noise = context.noise if self.training or self.latents == "samples" else None
         features, memory = self.encoder(video, None if before is None else before.memory)
-        steps, slots = self.objects(
-            video, features, None if before is None else before.slots, noise, context.schedule
-        )
+        steps, slots = self.objects(video, features, None if before is None else before.slots, noise, context.schedule)
         layers = self.objects.render(steps, context.schedule)
         with full_precision(video):
             rendered, background, terms = self._render(video, layers, before, noise)
@@ -153,9 +151,7 @@ class Scalor(SceneModel):
         objects = layers.colour / (layers.weight + GUARD)[:, :, None]
         q = self.recompute(self.background.posterior, video.flatten(0, 1), foreground.flatten(0, 1))
         latent = q.sample(None if noise is None else noise.at(0, t))
-        prior, after = self.background.prior(
-            latent.unflatten(0, (b, t)), None if before is None else before.background
-        )
+        prior, after = self.background.prior(latent.unflatten(0, (b, t)), None if before is None else before.background)
         q = type(q)(*(x.unflatten(0, (b, t)) for x in q))
         backdrop = self.recompute(self.background.draw, latent).unflatten(0, (b, t))
         image = objects + (1 - foreground)[:, :, None] * backdrop

@@ -69,9 +69,7 @@ class PropagationPrior(nn.Module):
         h, c = self.rnn(self.input(seen).flatten(0, 1).to(state[0].dtype), state)
         return h.unflatten(0, count), c.unflatten(0, count)
 
-    def heads(
-        self, h: Float[Tensor, "*batch hidden"]
-    ) -> tuple[Gaussian, Gaussian, Gaussian, Float[Tensor, "*batch"]]:
+    def heads(self, h: Float[Tensor, "*batch hidden"]) -> tuple[Gaussian, Gaussian, Gaussian, Float[Tensor, "*batch"]]:
         """Priors of z_what, the raw z_where and z_depth, and the probability to be present."""
         present = torch.sigmoid(self.presence(h).float() + PRESENT_BY_PRIOR).squeeze(-1)
         return gaussian_of(self.what(h)), gaussian_of(self.where(h)), gaussian_of(self.depth(h)), present
@@ -161,9 +159,7 @@ class Propagation(nn.Module):
         return gated(gaussian_of(glimpse), gaussian_of(self.what(tracker)), gates)
 
 
-def gated(
-    glimpse: Gaussian, temporal: Gaussian, gates: Float[Tensor, "*batch 2"]
-) -> Gaussian:
+def gated(glimpse: Gaussian, temporal: Gaussian, gates: Float[Tensor, "*batch 2"]) -> Gaussian:
     """The posterior of z_what from what is seen and what was known.
 
     The standard deviation goes through a second softplus, as published, so it is never below log 2.

@@ -228,11 +228,11 @@ class ObjectNetworks(nn.Module):
         curriculum = (schedule["alpha_curriculum"] > 0.5) & (index >= slots)
         counted = torch.where(curriculum, 0.0, 1.0)
         drawn = [joined_candidates(step, step.drawn, step.drawn_found) if full else None for step in steps]
-        layers = [
+        frames = [
             self.recompute(self._layers, picture, *inputs)
             for picture, *inputs in zip(drawn, values.unbind(1), counted.unbind(1), strict=True)
         ]
-        layers = Layers(*(torch.stack(sums, dim=1) for sums in zip(*layers, strict=True)))
+        layers = Layers(*(torch.stack(sums, dim=1) for sums in zip(*frames, strict=True)))
         every = torch.where(schedule["alpha_curriculum"] > 0.5, CURRICULUM_ALPHA * steps[0].found.shape[1], 0.0)
         return layers._replace(alpha=layers.alpha + every)
 
@@ -240,9 +240,7 @@ class ObjectNetworks(nn.Module):
         presence, depth, where, what = values.split([1, 1, 4, self.what], dim=-1)
         if drawn is None:
             drawn = self.glimpse_decoder(what)
-        return layers_of(
-            drawn, presence.squeeze(-1), depth.squeeze(-1), window_of(where), counted, self.image_size
-        )
+        return layers_of(drawn, presence.squeeze(-1), depth.squeeze(-1), window_of(where), counted, self.image_size)
 
 
 def _rendered(step: Step) -> Float[Tensor, "B K D"]:

@@ -33,9 +33,7 @@ class Objects(NamedTuple):
     absence: Tensor
 
     @staticmethod
-    def found(
-        what: Tensor, where: Tensor, depth: Tensor, presence: Tensor, hidden: int, hidden_prior: int
-    ) -> Objects:
+    def found(what: Tensor, where: Tensor, depth: Tensor, presence: Tensor, hidden: int, hidden_prior: int) -> Objects:
         """Objects that were just discovered: raw where, recurrent states and absence start at zero."""
 
         def zeros(n: int) -> Tensor:

@@ -90,9 +90,7 @@ def discovered(raw: Float[Tensor, "B D 4"], size: SizeRule, grid: int) -> Float[
     return torch.cat([size(raw[..., :2]), centre], dim=-1)
 
 
-def propagated(
-    raw: Float[Tensor, "B P 4"], before: Float[Tensor, "B P 4"], size: SizeRule
-) -> Float[Tensor, "B P 4"]:
+def propagated(raw: Float[Tensor, "B P 4"], before: Float[Tensor, "B P 4"], size: SizeRule) -> Float[Tensor, "B P 4"]:
     """z_where of objects carried on: the centre moves from where it was, the size is inferred from scratch."""
     centre = (before[..., 2:] + SHIFT * torch.tanh(raw[..., 2:])).clamp(-EDGE, EDGE)
     return torch.cat([size(raw[..., :2]), centre], dim=-1)
