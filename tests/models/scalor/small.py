@@ -24,7 +24,7 @@ def small(seed: int = 0, lively: bool = True, **arguments: Any) -> Scalor:
         with torch.no_grad():
             for head in (model.objects.discovery.presence[-1], model.objects.discovery.depth[-1]):
                 head.weight.mul_(8)
-            model.objects.glimpse_decoder.alpha[-1].weight.mul_(4)
+            model.objects.glimpse_decoder.alpha.out.weight.mul_(4)
     return model
 
 
