@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, laid_out, same
 from apex_lab.models.scalor.latents import gaussian_of
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.precision import full
 from apex_lab.nn.splitting import joined, part_size
 
 DecoderKind = Literal["strong", "weak"]
@@ -99,7 +100,7 @@ class Background(nn.Module):
     def draw(self, latent: Float[Tensor, "N Z"]) -> Float[Tensor, "N 3 H W"]:
         """RGB in [0, 1]."""
         size = part_size(len(latent), self.largest, latent)
-        return joined(torch.sigmoid(self.decoder(part[..., None, None]).float()) for part in latent.split(size))
+        return joined(torch.sigmoid(full(self.decoder(part[..., None, None]))) for part in latent.split(size))
 
     def prior(
         self, latent: Float[Tensor, "B T Z"], before: tuple[Tensor, Tensor] | None

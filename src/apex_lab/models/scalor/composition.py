@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from apex_lab.models.scalor.latents import GUARD, full_precision
+from apex_lab.nn.precision import full
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.nn.splitting import joined, part_size
 
@@ -35,7 +36,7 @@ class Layers(NamedTuple):
 
 def paster_of(windows: Float[Tensor, "*batch 4"], glimpse: int, size: int) -> Paster:
     """Pastes through windows (s_y, s_x, t_y, t_x) that may have a size of zero."""
-    scale, centre = windows.float().split(2, dim=-1)
+    scale, centre = full(windows).split(2, dim=-1)
     return Paster(torch.cat([scale + SCALE_GUARD, centre], dim=-1), glimpse, size)
 
 
@@ -58,7 +59,7 @@ def layers_of(
         size: H = W in pixels.
     """
     with full_precision(drawn):
-        nearness = torch.sigmoid(-depth.float())
+        nearness = torch.sigmoid(-full(depth))
         each = part_size(len(drawn), 4 * size * size * drawn.shape[1], drawn)
         inputs = [x.split(each) for x in (drawn, presence, nearness, windows, counted)]
         parts = [_layers_of_part(size, *part) for part in zip(*inputs, strict=True)]
@@ -68,7 +69,7 @@ def layers_of(
 def _layers_of_part(
     size: int, drawn: Tensor, presence: Tensor, nearness: Tensor, windows: Tensor, counted: Tensor
 ) -> Layers:
-    drawn = drawn.float()
+    drawn = full(drawn)
     alpha = drawn[:, :, 3:] * presence[..., None, None, None]
     maps = paster_of(windows, drawn.shape[-1], size).each(torch.cat([drawn[:, :, :3] * alpha, alpha], dim=2))
     mask = maps[:, :, 3:]

@@ -16,6 +16,7 @@ from apex_lab.models.scalor.latents import GUARD, Sampler, bounded_logit, full_p
 from apex_lab.models.scalor.recompute import Recompute
 from apex_lab.models.scalor.windows import SizeRule, discovered, window_of
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.precision import full
 from apex_lab.nn.splitting import part_size
 
 MASK_CODE = 32
@@ -140,12 +141,12 @@ class Rejection:
         """
         with full_precision(alpha):
             size = explained.shape[-1]
-            taken = (explained > self.explained).float().flatten(1)[..., None]
+            taken = (explained > self.explained).to(full(alpha).dtype).flatten(1)[..., None]
             each = part_size(alpha.shape[1], size * size * len(alpha), alpha)
             shares = []
             for some, places in zip(alpha.split(each, 1), windows.split(each, 1), strict=True):
-                maps = paster_of(places, alpha.shape[-1], size).each(some[:, :, None].float()).flatten(2)
-                mine = (maps > self.alpha).float()
+                maps = paster_of(places, alpha.shape[-1], size).each(full(some[:, :, None])).flatten(2)
+                mine = (maps > self.alpha).to(maps.dtype)
                 shares.append((mine @ taken).squeeze(-1) / (mine.sum(-1) + GUARD))
         return torch.cat(shares, dim=1) < self.ratio
 

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.precision import full
 from apex_lab.scene import Noise
 
 LOGIT_BOUND = 8.8
@@ -30,13 +31,13 @@ def full_precision(like: Tensor) -> torch.autocast:
 
 def gaussian_of(raw: Float[Tensor, "... two_D"], offset: float = 0.0) -> Gaussian:
     """Means, then raw standard deviations -> a Gaussian with std = softplus(raw + offset), in float32."""
-    mean, spread = raw.float().chunk(2, dim=-1)
+    mean, spread = full(raw).chunk(2, dim=-1)
     return Gaussian(mean, F.softplus(spread + offset).clamp_min(TINY_STD))
 
 
 def bounded_logit(raw: Float[Tensor, "..."], offset: float = 0.0) -> Float[Tensor, "..."]:
     """Presence logit in (-8.8, 8.8), in float32."""
-    return LOGIT_BOUND * torch.tanh(raw.float() + offset)
+    return LOGIT_BOUND * torch.tanh(full(raw) + offset)
 
 
 def relaxed_logit(

@@ -18,6 +18,7 @@ from apex_lab.models.scalor.slots import Objects
 from apex_lab.models.scalor.windows import SizeRule, propagated, window_of
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.precision import full
 from apex_lab.nn.spatial_transformer import crop
 
 PRESENT_AT_FIRST = 2.0
@@ -71,7 +72,7 @@ class PropagationPrior(nn.Module):
 
     def heads(self, h: Float[Tensor, "*batch hidden"]) -> tuple[Gaussian, Gaussian, Gaussian, Float[Tensor, "*batch"]]:
         """Priors of z_what, the raw z_where and z_depth, and the probability to be present."""
-        present = torch.sigmoid(self.presence(h).float() + PRESENT_BY_PRIOR).squeeze(-1)
+        present = torch.sigmoid(full(self.presence(h)) + PRESENT_BY_PRIOR).squeeze(-1)
         return gaussian_of(self.what(h)), gaussian_of(self.where(h)), gaussian_of(self.depth(h)), present
 
 
@@ -139,7 +140,7 @@ class Propagation(nn.Module):
         half = torch.full_like(where[..., :2], 0.5)
         windows = window_of(torch.cat([half, where[..., 2:].detach()], dim=-1))
         with full_precision(features):
-            seen = crop(features.float(), windows, self.look)
+            seen = crop(full(features), windows, self.look)
         return self.attention_code(self.attention(seen.flatten(0, 1)).flatten(1)).unflatten(0, where.shape[:2])
 
     def _track(self, before: Objects, code: Float[Tensor, "B P code"]) -> Float[Tensor, "B P hidden"]:
@@ -155,7 +156,7 @@ class Propagation(nn.Module):
         code: Float[Tensor, "B P code"],
     ) -> Gaussian:
         """z_what from the glimpse and from the past."""
-        gates = torch.sigmoid(self.gates(torch.cat([tracker, code], dim=-1)).float())
+        gates = torch.sigmoid(full(self.gates(torch.cat([tracker, code], dim=-1))))
         return gated(gaussian_of(glimpse), gaussian_of(self.what(tracker)), gates)
 
 

@@ -12,6 +12,7 @@ from apex_lab.models.scalor.composition import Layers, paster_of
 from apex_lab.models.scalor.latents import GUARD
 from apex_lab.models.scalor.rollout import Step, joined_candidates
 from apex_lab.models.scalor.windows import window_of
+from apex_lab.nn.precision import full
 from apex_lab.nn.splitting import part_size
 
 Readout = Literal["rendering", "overlay"]
@@ -72,9 +73,9 @@ def frame_masks(
     for alpha, windows, presence, depth in zip(
         *(x.split(each, dim=1) for x in (frame.alpha, frame.windows, frame.presence, frame.depth)), strict=True
     ):
-        present = alpha.float() * presence[..., None, None]
+        present = full(alpha) * presence[..., None, None]
         mask = paster_of(windows, alpha.shape[-1], size).each(present[:, :, None]).squeeze(2)
-        importance = torch.sigmoid(-depth.float())[..., None, None] * mask
+        importance = torch.sigmoid(-full(depth))[..., None, None] * mask
         objects.append(importance * mask if readout == "rendering" else importance)
     masks = torch.cat(objects, dim=1)
     if readout == "rendering":
@@ -94,7 +95,7 @@ def frame_means(
     frame: Frame, colour: Float[Tensor, "B P 3 g g"], backdrop: Float[Tensor, "B 3 H W"]
 ) -> Float[Tensor, "B P_plus_1 3 H W"]:
     """Each kept object's own image, black outside of its window, and the background's."""
-    pasted = paster_of(frame.windows, colour.shape[-1], backdrop.shape[-1]).each(colour.float())
+    pasted = paster_of(frame.windows, colour.shape[-1], backdrop.shape[-1]).each(full(colour))
     return torch.cat([pasted * frame.kept[..., None, None, None], backdrop[:, None]], dim=1).clamp(0, 1)
 
 

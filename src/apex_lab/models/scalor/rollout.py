@@ -18,6 +18,7 @@ from apex_lab.models.scalor.recompute import Recompute
 from apex_lab.models.scalor.slots import FIRST_ID, Objects, Slots, carry, keep, pack, strongest, taken
 from apex_lab.models.scalor.windows import SizeRule, window_of
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.precision import full
 from apex_lab.scene import ABSENT, Noise, Schedule
 
 CURRICULUM_ALPHA = 0.9
@@ -169,7 +170,7 @@ class ObjectNetworks(nn.Module):
         objects = propagated.objects
         drawn = self._drawn(objects.what)
         with torch.no_grad(), full_precision(image):
-            masks = drawn[:, :, -1].float() * objects.presence[..., None]
+            masks = full(drawn[:, :, -1]) * objects.presence[..., None]
             explained = paster_of(window_of(objects.where), masks.shape[-1], self.image_size).total(masks)
         return propagated, drawn, explained
 
