@@ -43,7 +43,7 @@ REFUSED = {
     "model.components=2.5": "model.components = 2.5 is wrong: input should be a valid integer.",
     "model.components=1": "model (tests.tiny.Layers): components = 1 leaves no room for an object: give at least 2.",
     "model._target_=tests.tiny.Layer": "model._target_ = 'tests.tiny.Layer' cannot be imported",
-    "model._target_=tests.tiny.SquaresModule": "Unknown key model.components = 3.",
+    "model._target_=tests.tiny.SquaresSource": "Unknown key model.components = 3.",
     "loss.spred=1": "Unknown key loss.spred: the model has error, spread; did you mean 'spread'?",
     "~loss.spread": "loss.spread is missing: the model needs error, spread.",
     "loss.error=x": "loss.error = 'x' is wrong",
