@@ -1,5 +1,6 @@
-# `make quickstart`: from a fresh clone to a picture. Needs python3.11 (or newer, with data that are there) and make.
-# Runs in the active virtual environment, else in .venv, which it makes.
+# `make quickstart`: from a fresh clone to pictures of a trained model. Needs Python 3.11, 3.12 or 3.13 and make.
+# Runs in the active virtual environment, else in .venv, which it makes with BASE_PYTHON: by default the first of these
+# Pythons that is found. To change the Python of an existing .venv, delete it first.
 
 ifdef VIRTUAL_ENV
 VENV := $(VIRTUAL_ENV)
@@ -8,7 +9,8 @@ VENV := .venv
 endif
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.apex_lab_installed
-BASE_PYTHON ?= $(shell command -v python3.11 || command -v python3)
+BASE_PYTHON ?= $(shell for name in python3.11 python3.12 python3.13; do \
+	$$name -c '' 2>/dev/null && echo $$name && exit; done; echo python3)
 
 .PHONY: quickstart install test test-all lint types contracts
 

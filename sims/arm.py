@@ -1,4 +1,4 @@
-"""The Panda arm: PyBullet's own model, redrawn with few faces, and the way it follows a straight line."""
+"""The Panda arm: PyBullet's model with decimated meshes, and inverse kinematics along a straight line."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ FACES = {
     "panda_leftfinger": 100,
     "panda_rightfinger": 100,
 }
-"""Triangles kept of each drawn link, of 101,735 in all."""
+"""Triangles of each decimated link; the original links have 101,735 in all."""
 CELL_PX = 10
 IK_CALLS, IK_ERROR_M = 30, 2e-4
-"""PyBullet's solver creeps: it is asked again from where it got to, until it is near enough."""
+"""PyBullet's solver converges slowly: it is called repeatedly from its last solution until within tolerance."""
 POINTS_PER_M2 = 400_000
 
 JOINTS = (0, 1, 2, 3, 4, 5, 6, 9, 10)
@@ -50,13 +50,13 @@ FORCE_N = (87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0, 20.0, 20.0)
 
 @dataclass(frozen=True)
 class ArmModel:
-    """URDFs of the same kinematics: as it comes, to draw (few faces, no contacts), to touch (hulls, nothing drawn).
+    """Three URDFs of the same kinematics: original, visual (decimated, no collisions), physics (hulls, no visuals).
 
     Attributes:
         original: PyBullet's own URDF.
         visual: URDF for a stage.
         physics: URDF for a world.
-        hulls: link name -> (N, 3) metres, vertices of the drawn link's convex hull in the link's frame.
+        hulls: link name -> (N, 3) metres, vertices of the visual link's convex hull in the link's frame.
     """
 
     original: Path
@@ -66,14 +66,14 @@ class ArmModel:
 
 
 class Links:
-    """Where the drawn links are."""
+    """World positions of the visual links."""
 
     def __init__(self, model: ArmModel) -> None:
         self._hulls = model.hulls
         self._order: list[tuple[int, np.ndarray]] = []
 
     def points(self, bullet: Client, arm: int) -> list[np.ndarray]:
-        """World vertices (N, 3) of every link's hull, in metres, base first."""
+        """World vertices (N, 3) of each link's hull, in metres, base first."""
         if not self._order:
             count = bullet.call("getNumJoints", arm)
             names = [bullet.call("getJointInfo", arm, joint)[12].decode() for joint in range(count)]
@@ -102,7 +102,7 @@ def arm_model() -> ArmModel:
 
 
 def _make(source: Path, target: Path) -> None:
-    """Write both URDFs with their meshes, and the drawn links' hulls."""
+    """Write both URDFs with their meshes, and the visual links' hulls."""
     hulls: dict[str, np.ndarray] = {}
     for kind, other in (("visual", "collision"), ("collision", "visual")):
         tree = ElementTree.parse(source / "panda.urdf")
@@ -135,7 +135,7 @@ def _moved(points: np.ndarray, origin: ElementTree.Element | None) -> np.ndarray
 
 
 def _redraw(source: Path, target: Path, faces: int) -> np.ndarray:
-    """Write a copy with few faces, its colours baked into a picture; returns its vertices (N, 3)."""
+    """Write a decimated copy with its colours baked into a texture; returns its vertices (N, 3)."""
     scene = trimesh.load_scene(source)
     parts = [part for part in scene.geometry.values() if isinstance(part, trimesh.Trimesh)]
     ends = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -170,7 +170,7 @@ def _coloured_points(parts: list[trimesh.Trimesh]) -> tuple[np.ndarray, np.ndarr
 
 
 def _face_colours(part: trimesh.Trimesh) -> np.ndarray:
-    """(F, 3) a colour per triangle: of its texture's middle, or else of its material."""
+    """(F, 3) a colour per triangle: the texture at its centroid, else its material."""
     material, uv = getattr(part.visual, "material", None), getattr(part.visual, "uv", None)
     if material is None:
         return np.full((len(part.faces), 3), 255)
@@ -185,12 +185,12 @@ def _face_colours(part: trimesh.Trimesh) -> np.ndarray:
 
 
 def joint_path(bullet: Client, arm: int, points: np.ndarray, yaw_rad: float) -> tuple[np.ndarray, float]:
-    """Joint angles (N, 7) that bring the point between the fingertips to each of `points` (N, 3), gripper down.
+    """Joint angles (N, 7) that put the point between the fingertips at each of `points` (N, 3), gripper down.
 
-    The arm is left in the first configuration.
+    By inverse kinematics; leaves the arm in the first configuration.
 
     Returns:
-        The angles, and the largest distance in metres between a point and where the arm really gets.
+        The angles, and the largest distance in metres between a point and the position reached.
     """
     down = bullet.call("getQuaternionFromEuler", (np.pi, 0.0, yaw_rad))
     bounds = {

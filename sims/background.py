@@ -1,4 +1,4 @@
-"""What never moves: a wooden table in a plain room, ray-cast once per camera, with exact depth and smooth edges."""
+"""The static background: a wooden table in a plain room, ray-cast once per camera, with exact depth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WALL_M = 2.5
 """Distance of the four walls from the robot."""
 
 RAYS = 4
-"""Rays per pixel and axis for the colours; depth is that of the pixel's middle."""
+"""Rays per pixel and axis for the colours; depth is taken at the pixel centre."""
 PLANK_M = 0.13
 WOOD = np.array([158.0, 132.0, 104.0])
 EDGE = np.array([96.0, 76.0, 58.0])
@@ -33,8 +33,8 @@ class Background:
     Attributes:
         rgb: (H, W, 3) float32 in [0, 255].
         depth: (H, W) float64, metres along the optical axis.
-        points: (H, W, 3) metres, the world point seen in the middle of each pixel.
-        table: (H, W) bool, the pixel shows the table's top.
+        points: (H, W, 3) metres, the world point seen at each pixel centre.
+        table: (H, W) bool, True where the table top is visible.
     """
 
     rgb: np.ndarray
@@ -44,7 +44,7 @@ class Background:
 
 
 def background(camera: Camera, size_px: int) -> Background:
-    """Draw the empty scene for a camera."""
+    """Render the empty scene for a camera."""
     fine = size_px * RAYS
     directions = _rays(camera, size_px, fine)
     origin = np.asarray(camera.eye)
@@ -94,7 +94,7 @@ def _colours(points: np.ndarray, surface: np.ndarray) -> np.ndarray:
 
 
 def _wood(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Planks that run along y, each with a tone and grain of its own."""
+    """Planks along y, each with its own tone and grain."""
     across = x / PLANK_M
     plank = np.floor(across)
     within = across - plank

@@ -1,28 +1,44 @@
-"""The door to PyBullet: importing it, and servers of one's own."""
+"""Access to PyBullet: the module, the version that is installed, private physics servers."""
 
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 from sims.errors import SimError
+
+INSTALL = (
+    "run `pip install pybullet` (Python 3.11) or `pip install pybullet-arm64` (Python 3.12 and 3.13, see SECURITY.md)"
+)
 
 
 def load_pybullet() -> Any:
     """The `pybullet` module; imported late because prepared data is usable without it.
 
     Raises:
-        SimError: PyBullet is not installed (it has no wheels for Python 3.12 and later).
+        SimError: PyBullet is not installed.
     """
     try:
         return importlib.import_module("pybullet")
     except ImportError as error:
         raise SimError(
-            "PyBullet is not installed: to simulate, use Python 3.11 (there are no wheels for later versions); "
-            "training on data that is already made needs no simulator."
+            f"PyBullet is not installed: {INSTALL}; training on data that is already made needs no simulator."
         ) from error
+
+
+@lru_cache(maxsize=1)
+def pybullet_version() -> str | None:
+    """Version of the distribution that provides the module `pybullet`; None if there is none.
+
+    Several distributions provide it, for example pybullet-arm64; any but `pybullet` itself is named too:
+    "3.2.8 (pybullet-arm64)".
+    """
+    names = sorted(set(importlib.metadata.packages_distributions().get("pybullet", ())))
+    found = [(name, importlib.metadata.version(name)) for name in names]
+    return " + ".join(version if name == "pybullet" else f"{version} ({name})" for name, version in found) or None
 
 
 def load_pybullet_data() -> str:
@@ -32,7 +48,7 @@ def load_pybullet_data() -> str:
 
 
 class Client:
-    """One private PyBullet server without a window."""
+    """A private PyBullet server in direct mode (no GUI)."""
 
     def __init__(self) -> None:
         self.module = load_pybullet()

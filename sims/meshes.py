@@ -1,4 +1,4 @@
-"""Geometry that is made once: object frames, few-faced copies, normals, collision hulls, OBJ files."""
+"""Mesh processing: object frames, decimation, normals, collision hulls, OBJ files."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 import trimesh
 
 CREASE_RAD = np.radians(40.0)
-"""Faces that meet at a sharper angle than this keep an edge between them when shaded."""
+"""Faces that meet at a sharper angle than this are shaded with an edge between them."""
 
 
 def object_frame(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """The mesh in its object frame: origin at the centre of the bounding box, z as scanned, x along the longer side.
 
-    The scans stand on the table with z up but turned by any angle about z; the frame's horizontal axes are those of the
-    smallest rectangle around the outline.
+    The scans have z up and an arbitrary yaw; the frame's horizontal axes are those of the minimum-area rectangle around
+    the outline.
     """
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
     outline = trimesh.convex.hull_points(vertices[:, :2])
@@ -72,7 +72,7 @@ def corner_normals(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
 
 
 def hull_vertices(points: np.ndarray, directions: int = 100) -> np.ndarray:
-    """(N, 3): the extreme points of a cloud in evenly spread directions; a light convex hull for contacts."""
+    """(N, 3): the extreme points of a cloud in evenly spread directions; an approximate convex hull for contacts."""
     index = np.arange(directions) + 0.5
     height = 1 - 2 * index / directions
     turn = np.pi * (1 + 5**0.5) * index
@@ -84,17 +84,17 @@ def hull_vertices(points: np.ndarray, directions: int = 100) -> np.ndarray:
 
 
 def dense_points(mesh: trimesh.Trimesh) -> np.ndarray:
-    """(N, 3): points all over a mesh whose triangles may be large, no farther apart than a thirtieth of its length."""
+    """(N, 3): vertices of a mesh subdivided until no edge is longer than a thirtieth of its largest extent."""
     longest = float(np.ptp(np.asarray(mesh.vertices), axis=0).max()) / 30
     vertices, _ = trimesh.remesh.subdivide_to_size(np.asarray(mesh.vertices), np.asarray(mesh.faces), longest, 20)[:2]
     return np.unique(np.round(vertices, 6), axis=0)
 
 
 def convex_parts(points: np.ndarray, name: str, convex: bool) -> list[np.ndarray]:
-    """Vertex clouds whose hulls make up the collision body.
+    """Vertex clouds whose convex hulls form the collision body.
 
-    A shape that is not convex is cut across its longest horizontal side into slices (a banana), a mug into its cup,
-    which is solid for contacts, and its handle.
+    A non-convex shape is sliced across its longest horizontal side (banana); the mug is split into its cup, solid for
+    contacts, and its handle.
     """
     if convex:
         return [hull_vertices(points)]
@@ -117,7 +117,7 @@ def convex_parts(points: np.ndarray, name: str, convex: bool) -> list[np.ndarray
 
 
 def _cup(points: np.ndarray) -> tuple[np.ndarray, float]:
-    """Centre (2,) and radius of a mug's cup: the circle that the side opposite the handle lies on."""
+    """Centre (2,) and radius of a mug's cup, from a circle fit to its base."""
     low = points[points[:, 2] < np.quantile(points[:, 2], 0.05)][:, :2]
     outline = trimesh.convex.hull_points(low)
     system = np.column_stack([2 * outline, np.ones(len(outline))])
@@ -143,7 +143,7 @@ def write_obj(
         triangles: (F, 3).
         normals: (F, 3, 3) per corner.
         uv: (F, 3, 2) per corner in [0, 1], v upwards.
-        texture: file name of the picture beside the OBJ.
+        texture: file name of the image beside the OBJ.
     """
     lines = [f"mtllib {path.stem}.mtl", "o object"]
     lines += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in vertices]
@@ -158,7 +158,7 @@ def write_obj(
 
 
 def write_hulls(path: Path, parts: list[np.ndarray]) -> None:
-    """Write convex parts as one OBJ with one group per part (PyBullet makes a compound of hulls of it)."""
+    """Write convex parts as one OBJ with one group per part, which PyBullet loads as a compound of hulls."""
     lines: list[str] = []
     first = 1
     for number, part in enumerate(parts):

@@ -1,4 +1,4 @@
-"""The catalogue of household objects: which YCB scans, how heavy, how they can rest, what is drawn on them."""
+"""The catalogue of household objects: YCB scan, mass, resting orientations and texture layout of each."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from math import pi
 from sims.textures import Projection
 
 Rest = tuple[str, float, float]
-"""Name, roll and pitch in radians of an orientation in which the object can stand or lie."""
+"""Name, roll and pitch in radians of a resting orientation."""
 
 UPRIGHT: Rest = ("upright", 0.0, 0.0)
 ON_BACK: Rest = ("on_back", pi / 2, 0.0)
@@ -24,7 +24,7 @@ class Entry:
         name: short name, used in labels and file names.
         ycb: identifier in the YCB Object and Model Set.
         mass_kg: as measured by the makers of the set (Calli et al. 2015); None: unknown.
-        projection: how texture coordinates are laid over the scan.
+        projection: how texture coordinates are assigned to the scan.
         rests: orientations of the object frame (z up as scanned, x along the longer horizontal side).
         faces: triangles of the drawn copy, of 16,384 in the scan.
         convex: False for shapes whose collision body is split into several convex parts.

@@ -1,4 +1,4 @@
-"""Textured models that a person brings along: one sub-folder per object, with an OBJ and its picture."""
+"""Textured models from a user's folder: one sub-folder per object, with an OBJ and its texture image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from PIL import Image
 from sims.errors import SimError
 
 PICTURE_PX = 1024
-"""Larger pictures are brought down to this side first: what is drawn is smaller still."""
+"""Larger textures are downsampled to this side first."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class TexturedModel:
 
 
 def plain_name(name: str) -> str:
-    """A name without the set's ornaments: '011_banana', 'YcbBanana' and 'banana' are all 'banana'."""
+    """A name without the set's prefixes: '011_banana', 'YcbBanana' and 'banana' are all 'banana'."""
     bare = re.sub(r"[^a-z0-9]", "", name.lower())
     return re.sub(r"^(ycb|\d{3})+", "", bare)
 
@@ -34,18 +34,18 @@ def find(root: str, name: str) -> TexturedModel:
     """The textured model of a class in the folder `root`.
 
     Raises:
-        SimError: the folder, the object's sub-folder, its OBJ with texture coordinates or its picture is missing.
+        SimError: the folder, the object's sub-folder, its OBJ with texture coordinates or its texture is missing.
     """
     folder = Path(root).expanduser()
     if not folder.is_dir():
-        raise SimError(f"objects_root {root!r} is no folder: name the folder that has one sub-folder per object.")
+        raise SimError(f"objects_root {root!r} is not a folder: name the folder that has one sub-folder per object.")
     there = {plain_name(path.name): path for path in sorted(folder.iterdir()) if path.is_dir()}
     place = there.get(plain_name(name))
     if place is None:
         found = ", ".join(path.name for path in there.values()) or "nothing"
         raise SimError(
-            f"objects_root {root!r} has no sub-folder for object {name!r} (there is {found}): add it, or name in "
-            "objects only what is there."
+            f"objects_root {root!r} has no sub-folder for object {name!r} (it has {found}): add it, or leave it "
+            "out of objects."
         )
     meshes = [path for path in sorted(place.rglob("*.obj")) if _has_texture_coordinates(path)]
     if not meshes:
@@ -60,7 +60,7 @@ def _has_texture_coordinates(path: Path) -> bool:
 
 
 def _picture(mesh: Path) -> Path:
-    """The picture that the OBJ's material names, else the only PNG beside it."""
+    """The texture that the OBJ's material names, else the only PNG beside it."""
     for material in mesh.parent.glob("*.mtl"):
         for line in material.read_text().splitlines():
             words = line.split(maxsplit=1)
@@ -69,12 +69,13 @@ def _picture(mesh: Path) -> Path:
                 if named.is_file():
                     return named
                 raise SimError(
-                    f"{material} names the picture {words[1].strip()!r}, which is missing: put it beside it."
+                    f"{material} names the texture {words[1].strip()!r}, which is missing: put it beside that file."
                 )
     pictures = sorted(mesh.parent.glob("*.png"))
     if len(pictures) != 1:
         raise SimError(
-            f"{mesh.parent} has {len(pictures)} PNG files and no material says which belongs to {mesh.name}."
+            f"{mesh.parent} has {len(pictures)} PNG files and no material names the texture of {mesh.name}: "
+            "add an MTL file."
         )
     return pictures[0]
 
@@ -88,23 +89,23 @@ def load(model: TexturedModel) -> trimesh.Trimesh:
     """The mesh with its texture coordinates.
 
     Raises:
-        SimError: the file's texture coordinates do not belong to its faces.
+        SimError: the file's texture coordinates do not match its faces.
     """
     mesh = trimesh.load_mesh(model.mesh, process=False)
     if isinstance(mesh, trimesh.Scene):
         mesh = mesh.to_mesh()
     if not isinstance(mesh, trimesh.Trimesh) or getattr(mesh.visual, "uv", None) is None:
-        raise SimError(f"{model.mesh} has texture coordinates that do not belong to its faces: export it again.")
+        raise SimError(f"{model.mesh} has texture coordinates that do not match its faces: export it again.")
     return mesh
 
 
 def texture_coordinates(mesh: trimesh.Trimesh) -> np.ndarray:
     """(V, 2) of a mesh from `load`, v upwards."""
-    return np.asarray(getattr(mesh.visual, "uv"))  # noqa: B009, not every kind of visual has it
+    return np.asarray(getattr(mesh.visual, "uv"))  # noqa: B009 - only some kinds of visual have it
 
 
 def picture_of(model: TexturedModel) -> Image.Image:
-    """The picture, at most `PICTURE_PX` wide and high."""
+    """The texture, at most `PICTURE_PX` wide and high."""
     image = Image.open(model.picture).convert("RGB")
     if max(image.size) > PICTURE_PX:
         image = image.resize((PICTURE_PX, PICTURE_PX), Image.Resampling.BOX)

@@ -1,4 +1,4 @@
-"""Outlines of convex bodies in the picture: what they can cover, and where their shadow falls on the table."""
+"""Projected outlines of convex bodies: the pixels that they can cover, and their shadows on the table."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from sims.camera import Camera
 
 SUBPIXEL_BITS = 4
 PENUMBRA = 0.012
-"""Blur of a shadow's edge, as a share of the picture's side."""
+"""Blur of a shadow's edge, as a share of the image's side."""
 
 
 def cover(camera: Camera, size_px: int, points: np.ndarray) -> tuple[np.ndarray, float]:
-    """What a body can cover at most: (H, W) bool, a pixel wider than the outline of its vertices, and its far end.
+    """Upper bound of the pixels that a body covers: the outline of its vertices, dilated by one pixel.
 
     Args:
         points: (N, 3) metres in the world.
 
     Returns:
-        The pixels and the largest depth in metres; all pixels for a body that reaches before the near plane.
+        (H, W) bool, and the largest depth in metres; all pixels for a body that crosses the near plane.
     """
     pixels, depth = camera.project(points, size_px)
     far = float(depth.max())
@@ -31,12 +31,12 @@ def cover(camera: Camera, size_px: int, points: np.ndarray) -> tuple[np.ndarray,
 
 
 def shadows(camera: Camera, size_px: int, bodies: list[np.ndarray], light: np.ndarray) -> np.ndarray:
-    """Share of light that convex bodies keep from the plane z = 0, (H, W) uint8 in [0, 255], soft at the edge.
+    """Soft shadow of convex bodies on the plane z = 0: (H, W) uint8, 255 = all direct light blocked.
 
-    The shadow of a convex body on a plane is the convex hull of its vertices' shadows, in the world and in the picture.
+    The shadow of a convex body on a plane is the convex hull of its vertices' shadows, in the world and in the image.
 
     Args:
-        bodies: vertices (N, 3) of each body in metres; those below the plane count as on it.
+        bodies: vertices (N, 3) of each body in metres; those below the plane are moved onto it.
         light: (3,) direction towards the light, upwards.
     """
     points = np.concatenate(bodies)
@@ -54,6 +54,6 @@ def shadows(camera: Camera, size_px: int, bodies: list[np.ndarray], light: np.nd
 
 
 def _fixed_point(pixels: np.ndarray, size_px: int) -> np.ndarray:
-    """Points (N, 2), given as (column, row) with pixel middles at + 0.5, as OpenCV draws them with `SUBPIXEL_BITS`."""
+    """Points (N, 2), (column, row) with pixel centres at + 0.5, in OpenCV's fixed-point format with `SUBPIXEL_BITS`."""
     limit = 8 * size_px
     return np.rint((np.clip(pixels, -limit, limit) - 0.5) * 2**SUBPIXEL_BITS).astype(np.int32)

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def rotation(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
-    """(3, 3) matrix of a unit quaternion x, y, z, w."""
+    """(3, 3) matrix of a unit quaternion x, y, z, w, which is not normalised: stored poses are rounded to float32."""
     x, y, z, w = (float(value) for value in quaternion)
     return np.array(
         [
@@ -20,5 +20,5 @@ def rotation(quaternion: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def moved(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Points (N, 3) of a body in its frame, in the world."""
+    """Points (N, 3) from a body's frame to the world frame."""
     return points @ rotation(pose[3:]).T + pose[:3]

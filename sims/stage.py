@@ -1,4 +1,4 @@
-"""A server that only draws: posed bodies, no physics, so that a picture depends on poses alone."""
+"""A rendering-only PyBullet server: posed bodies, no physics, so an image depends on poses alone."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ AMBIENT, DIFFUSE, SPECULAR = 0.58, 0.52, 0.04
 
 
 class Stage:
-    """Arm and objects over nothing, seen by any camera.
+    """Arm and objects without a background, seen by any camera.
 
     Args:
-        backend: 'tiny' draws on the CPU; 'egl' needs a machine with EGL, which GPU drivers bring.
+        backend: 'tiny' renders on the CPU; 'egl' needs EGL, which GPU drivers provide.
         arm: the arm's model; None for a stage without it.
 
     Raises:
@@ -39,21 +39,21 @@ class Stage:
         self.bullet = Client()
         module = self.bullet.module
         if backend == "egl":
-            self._plugin = load_egl(self.bullet)
+            load_egl(self.bullet)
         self._renderer = module.ER_BULLET_HARDWARE_OPENGL if backend == "egl" else module.ER_TINY_RENDERER
         self.bodies: list[int] = []
         self.arm = -1
         if arm is not None:
-            # A graphics card draws the arm as it comes; the few faces are for the processor.
+            # The GPU renders the original arm; the decimated one is for the CPU.
             urdf = str(arm.original if backend == "egl" else arm.visual)
             self.arm = int(self.bullet.call("loadURDF", urdf, [0, 0, 0], useFixedBase=True))
             self._arm_base = self.bullet.call("getBasePositionAndOrientation", self.arm)
         if backend == "egl":
-            # The very first picture takes some of its light from defaults; none of ours may be the first.
+            # EGL lights the very first image partly from defaults: render one and discard it.
             self.draw(Camera(), 16)
 
     def show(self, models: tuple[ObjectModel, ...]) -> None:
-        """Put these objects on the stage instead of those before, out of sight until they are posed."""
+        """Replace the objects; each is out of sight until it is posed."""
         for body in self.bodies:
             self.bullet.call("removeBody", body)
         mesh = self.bullet.module.GEOM_MESH
@@ -70,20 +70,20 @@ class Stage:
         self.bullet.call("resetBasePositionAndOrientation", body, pose[:3].tolist(), pose[3:].tolist())
 
     def show_arm(self, visible: bool) -> None:
-        """Put the arm's base in its place, or out of sight; no matter on a stage without it."""
+        """Show or hide the arm; does nothing on a stage without one."""
         if self.arm >= 0:
             position, quaternion = self._arm_base if visible else (HIDDEN_POSE[:3].tolist(), (0, 0, 0, 1))
             self.bullet.call("resetBasePositionAndOrientation", self.arm, position, quaternion)
 
     def pose_joints(self, joints: np.ndarray) -> None:
-        """Bend the arm: (9,) joint angles in radians and finger positions in metres."""
+        """Set the arm's joints: (9,) angles in radians and finger positions in metres."""
         for joint, value in zip(panda.JOINTS, joints.tolist(), strict=True):
             self.bullet.call("resetJointState", self.arm, joint, value)
 
     def draw(self, camera: Camera, size_px: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Colour (H, W, 3) uint8, depth (H, W) float64 in metres, ids (H, W) uint8: 0 nothing, 1 arm, 2 + i object i.
+        """Colour (H, W, 3) uint8, depth (H, W) float64 in metres, ids (H, W) uint8: 0 empty, 1 arm, 2 + i object i.
 
-        Where there is nothing depth is infinite.
+        Depth is infinite in empty pixels.
         """
         view, projection = _matrices(camera, size_px, self.backend)
         _, _, rgba, buffer, bodies = self.bullet.call(
@@ -100,7 +100,7 @@ class Stage:
             shadow=0,
             renderer=self._renderer,
         )
-        # Body numbers become ids by one look-up: -1 (nothing) is the table's last entry.
+        # Body numbers become ids by one table look-up; -1 (empty) indexes the last entry.
         known = [self.arm, *self.bodies]
         table = np.zeros(max(known) + 2, dtype=np.uint8)
         table[known] = np.arange(ARM_ID, ARM_ID + len(known))
@@ -120,7 +120,7 @@ def load_egl(bullet: Client) -> int:
     """Load PyBullet's EGL renderer into a server.
 
     Raises:
-        SimError: it is not part of this PyBullet, or finds no EGL.
+        SimError: this build of PyBullet lacks it, or no EGL display is found.
     """
     spec = importlib.util.find_spec("eglRenderer")
     if spec is None or spec.origin is None:
@@ -135,7 +135,7 @@ def load_egl(bullet: Client) -> int:
 
 @lru_cache(maxsize=8)
 def _matrices(camera: Camera, size_px: int, backend: Backend) -> tuple[list[float], list[float]]:
-    """View and projection, the latter moved so that a pixel shows what lies behind its middle.
+    """View and projection, the latter shifted so that a pixel is sampled at its centre.
 
     TinyRenderer samples a pixel at its lower left corner, half a pixel from where a camera's intrinsics have it.
     """

@@ -1,4 +1,4 @@
-"""Closed outer surfaces of models made of many shells, and pictures baked from one surface onto another."""
+"""Watertight outer surfaces of models made of many shells, and texture baking from one surface to another."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ BLUR_CELLS = 1.2
 
 
 def outer_surface(mesh: trimesh.Trimesh, cells: int = 128) -> trimesh.Trimesh:
-    """A watertight, slightly rounded surface around a mesh; what is inside is gone.
+    """A watertight, slightly rounded surface around a mesh, without its interior.
 
-    CAD models consist of hundreds of open shells, which edge collapse tears apart. Here the mesh is put on a grid of
-    `cells` along its longest side; a cell is inside when it is hidden from at least five of the six axis directions (so
-    that an opening on one side does not hollow the part out), and the smoothed grid's level set is the surface.
+    CAD models consist of hundreds of open shells, which edge collapse tears apart. The mesh is voxelised on a grid of
+    `cells` along its longest side; a cell is inside when it is occluded from at least five of the six axis directions
+    (so that an opening on one side does not hollow the part), and the surface is the smoothed grid's level set.
     """
     points = np.asarray(mesh.vertices)
     pitch = float(np.ptp(points, axis=0).max()) / cells
@@ -42,8 +42,8 @@ def outer_surface(mesh: trimesh.Trimesh, cells: int = 128) -> trimesh.Trimesh:
 def level_set(field: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
     """Surface nets (Gibson 1998): the surface where a sampled field (X, Y, Z) falls below a level.
 
-    One vertex per grid cell that the surface passes, at the mean of its edges' crossings; one quad, as two triangles
-    facing downhill, per crossed grid edge. The field must stay below the level at the grid's border.
+    One vertex per crossed grid cell, at the mean of its edge crossings; two triangles, facing the lower side, per
+    crossed grid edge. The field must stay below the level at the grid's border.
 
     Returns:
         Vertices (V, 3) in grid units and triangles (F, 3).
@@ -90,10 +90,10 @@ def transferred_normals(vertices: np.ndarray, triangles: np.ndarray, smooth: tri
 def bake(
     vertices: np.ndarray, triangles: np.ndarray, points: np.ndarray, colours: np.ndarray, cell_px: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Paint a mesh with the colours of a cloud of points on (nearly) the same surface.
+    """Bake the colours of a point cloud on (nearly) the same surface into a texture for a mesh.
 
-    Triangles share square cells of the picture, two to a cell; every texel takes the colour of the point nearest to its
-    place on the mesh.
+    Each square cell of the texture holds two triangles; every texel takes the colour of the point nearest to its
+    position on the mesh.
 
     Args:
         vertices: (V, 3); triangles: (F, 3).
@@ -101,7 +101,7 @@ def bake(
         cell_px: side of a cell.
 
     Returns:
-        Picture (S, S, 3) uint8 and texture coordinates (F, 3, 2) in [0, 1], v upwards.
+        Texture (S, S, 3) uint8 and texture coordinates (F, 3, 2) in [0, 1], v upwards.
     """
     columns = int(np.ceil(np.sqrt((len(triangles) + 1) // 2)))
     size = columns * cell_px

@@ -1,14 +1,14 @@
-"""How a drawn picture lies on a scan: tiles of the picture, and texture coordinates by box or cylinder projection.
+"""Texture layout of the scans: tiles of the texture, and texture coordinates by box or cylinder projection.
 
-| projection | picture (width : height = 3 : 2) | which triangles show it |
+| projection | texture (width : height = 3 : 2) | triangles |
 |---|---|---|
 | box | six tiles, 3 x 2: front, back, top / right, left, bottom | by the largest component of the normal |
 | can | a strip around z over three tiles: top, bottom, inside | caps, hollow and the rest |
-| round | one strip around z, its height the polar angle from the top | all |
-| length | one strip around x, its height the place along x | all |
+| round | one strip around z, height = polar angle from the top | all |
+| length | one strip around x, height = position along x | all |
 
 The front faces -y, as the object frame's x axis runs along the longer side. Strips repeat a little at both ends, so
-that no triangle crosses the seam.
+no triangle crosses the seam.
 """
 
 from __future__ import annotations
@@ -20,15 +20,14 @@ import numpy as np
 Projection = Literal["box", "can", "round", "length"]
 
 WRAP = 0.12
-"""Share of a strip's turn that is repeated at each of its ends."""
+"""Share of a turn that a strip repeats at each end."""
 STRIP_HEIGHT = 0.68
-"""Share of a can's picture that the strip takes; the tiles of its caps take the rest."""
+"""Share of a can's texture used by the strip; the tiles of its caps use the rest."""
 INSET = 0.012
-"""Share of the picture kept free at a tile's border, so that neighbours never shine through."""
+"""Margin at a tile's border, as a share of the texture, so that neighbouring tiles never bleed in."""
 CAP_COSINE = 0.8
 
 BOX_TILES = ("front", "back", "top", "right", "left", "bottom")
-CAN_TILES = ("top", "bottom", "inside")
 
 
 def texture_coordinates(vertices: np.ndarray, triangles: np.ndarray, projection: Projection) -> np.ndarray:
@@ -37,7 +36,7 @@ def texture_coordinates(vertices: np.ndarray, triangles: np.ndarray, projection:
     Args:
         vertices: (V, 3) metres.
         triangles: (F, 3).
-        projection: the way of laying the picture.
+        projection: one of the table above.
     """
     corners = vertices[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -85,14 +84,14 @@ def _can(corners: np.ndarray, unit: np.ndarray, normals: np.ndarray, centre: np.
     bottom = (normals[:, 2] < -CAP_COSINE) & (middle[:, 2] < 0.1)
     hollow = (inward | (normals[:, 2] > CAP_COSINE)) & (np.abs(middle[:, :2] - 0.5).max(axis=1) < 0.45) & ~top
     uv = _strip(np.arctan2(corners[..., 1] - centre[1], corners[..., 0] - centre[0]), unit[..., 2], 1 - STRIP_HEIGHT)
-    for number, chosen in enumerate((top, bottom, hollow)):
+    for number, chosen in enumerate((top, bottom, hollow)):  # tiles in this order
         uv[chosen, :, 0] = _into(unit[chosen][..., 0], number / 3, (number + 1) / 3)
         uv[chosen, :, 1] = _into(unit[chosen][..., 1], 0.0, 1 - STRIP_HEIGHT)
     return uv
 
 
 def _strip(angle: np.ndarray, height: np.ndarray, floor: float) -> np.ndarray:
-    """Coordinates on a strip from `floor` to the picture's top; the front (-y, or below for x) is in its middle."""
+    """Coordinates on a strip from `floor` to the top; the front (-y; for `length`, below) is in the middle."""
     turn = (angle / (2 * np.pi) + 0.75) % 1.0
     middle = turn[:, :1]
     turn = middle + (turn - middle + 0.5) % 1.0 - 0.5

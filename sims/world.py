@@ -1,4 +1,4 @@
-"""A table with objects and an arm that obey physics; rebuilt from nothing for every episode."""
+"""The physics simulation: a table, objects and an arm, rebuilt from scratch for every episode."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from sims.bullet import Client
 
 STEPS_PER_S = 240
 TOUCH_M = 0.0005
-"""Bodies this near to each other touch: contacts are found a little before surfaces meet."""
+"""Bodies closer than this are in contact."""
 POSITION_GAINS, VELOCITY_GAINS = (0.3,) * 9, (1.0,) * 9
 
 
 class World:
-    """One physics server; `rebuild` empties it and sets the table, so that no episode knows of the one before."""
+    """A physics server; `rebuild` resets it completely, so episodes are independent of each other."""
 
     def __init__(self) -> None:
         self.bullet = Client()
-        # What is called at every step is looked up once.
+        # Functions that are called at every step are looked up once.
         self._step, self._set_motors, self._contact_points = (
             self.bullet.bound(name) for name in ("stepSimulation", "setJointMotorControlArray", "getContactPoints")
         )
@@ -32,7 +32,7 @@ class World:
         self.objects: list[int] = []
 
     def rebuild(self) -> None:
-        """An empty table."""
+        """Reset the simulation to an empty table."""
         bullet = self.bullet
         bullet.call("resetSimulation")
         bullet.call("setGravity", 0.0, 0.0, -9.81)
@@ -51,7 +51,7 @@ class World:
         self.arm, self.objects = -1, []
 
     def add_object(self, model: ObjectModel, position: np.ndarray, quaternion: np.ndarray) -> int:
-        """Put an object at a pose of its frame (metres; x, y, z, w)."""
+        """Add an object with its frame at a position (metres) and quaternion (x, y, z, w); returns its body number."""
         bullet = self.bullet
         shape = bullet.call("createCollisionShape", bullet.module.GEOM_MESH, fileName=str(model.collision))
         body = bullet.call("createMultiBody", model.mass_kg, shape, -1, position.tolist(), quaternion.tolist())
@@ -70,7 +70,7 @@ class World:
         return int(body)
 
     def add_arm(self) -> int:
-        """Load the arm with its base at the origin."""
+        """Load the arm with its base at the origin; returns its body number."""
         self.arm = self.bullet.call("loadURDF", self.arm_urdf, [0, 0, 0], useFixedBase=True)
         for joint in range(self.bullet.call("getNumJoints", self.arm)):
             self.bullet.call("changeDynamics", self.arm, joint, lateralFriction=0.5, restitution=0.0)
@@ -99,7 +99,7 @@ class World:
         return np.array([[*position, *quaternion] for position, quaternion in states])
 
     def fastest(self) -> tuple[float, float]:
-        """Largest speed in metres per second and largest turning speed in radians per second of all objects."""
+        """Largest linear speed (m/s) and largest angular speed (rad/s) over all objects."""
         states = [self.bullet.call("getBaseVelocity", body) for body in self.objects]
         return max(hypot(*linear) for linear, _ in states), max(hypot(*angular) for _, angular in states)
 
@@ -113,12 +113,12 @@ class World:
         return np.array([*state[4], *state[5]])
 
     def gap(self, body: int, reach_m: float) -> float:
-        """Smallest distance in metres between the arm and a body, `inf` when it is beyond `reach_m`."""
+        """Smallest distance in metres between the arm and a body; `inf` beyond `reach_m`."""
         points = self.bullet.call("getClosestPoints", self.arm, body, reach_m)
         return min((point[8] for point in points), default=np.inf)
 
     def contacts(self) -> tuple[list[int], list[tuple[int, int]]]:
-        """Who touches whom now: numbers of the objects that the arm touches, and pairs of touching objects."""
+        """Current contacts: indices of the objects that touch the arm, and index pairs of objects that touch."""
         contact_points, objects = self._contact_points, self.objects
         number = {body: i for i, body in enumerate(objects)}
         with_arm: set[int] = set()

@@ -1,4 +1,4 @@
-"""`python -m sims.p2d`: makes a P2D folder; `verify`, `card` and `export` work on a finished one."""
+"""`python -m sims.p2d`: generates a P2D folder; `verify`, `card` and `export` work on a finished one."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("stopped; what is made stays good, the same command goes on", file=sys.stderr)
+        print("interrupted; finished trajectories are kept, run the same command to resume", file=sys.stderr)
         return 130
     return code
 
@@ -40,12 +40,12 @@ def _make(options: argparse.Namespace) -> int:
         _card(argparse.Namespace(dir=root, out=None))
     made = ", ".join(f"{getattr(settings, split)} {split}" for split in SPLITS)
     redrawn = sum(record.redraws for record in manifest.records.values())
-    print(f"{root}: {made} trajectories, {total_bytes(settings) / 1e9:.2f} GB, {redrawn} drawn again")
+    print(f"{root}: {made} trajectories, {total_bytes(settings) / 1e9:.2f} GB, {redrawn} attempts redrawn")
     return 0
 
 
 def _begun(root: Path) -> Settings | None:
-    """Settings of a folder that is finished or begun, so that its making can be taken up without repeating them."""
+    """Settings of a finished or unfinished folder, so that resuming it does not need them on the command line."""
     if (root / MANIFEST).exists():
         return read_manifest(root).settings
     found = read_journal(root) if root.is_dir() else None
@@ -58,15 +58,15 @@ def _verify(options: argparse.Namespace) -> int:
         damage = repair(root, workers=options.workers)
         for line in damage.lines():
             print(line)
-        print(f"{root}: {'mended' if damage else 'nothing is damaged'}")
+        print(f"{root}: {'repaired' if damage else 'no damage found'}")
         return 0
     damage = verify(root, read_manifest(root))
     for line in damage.lines():
         print(line)
     if damage:
-        print(f"{root}: damaged; mend it with python -m sims.p2d verify {root} --repair")
+        print(f"{root}: damaged: repair it with python -m sims.p2d verify {root} --repair")
         return 1
-    print(f"{root}: all bytes are right")
+    print(f"{root}: all checksums match")
     return 0
 
 
@@ -88,25 +88,25 @@ def _export(options: argparse.Namespace) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m sims.p2d",
-        description="Makes the P2D data set, or goes on where it was stopped.",
+        description="Generate the P2D data set, or resume an interrupted generation.",
         epilog="settings (--set): " + ", ".join(f"{k}={v.default!r}" for k, v in Settings.model_fields.items()),
     )
     parser.set_defaults(run=_make)
-    parser.add_argument("--out", type=Path, default=Path("data/p2d"), help="folder to make (default: data/p2d)")
+    parser.add_argument("--out", type=Path, default=Path("data/p2d"), help="output folder (default: data/p2d)")
     parser.add_argument(
         "--set", nargs="+", action="extend", default=[], metavar="key=value", help="settings, see below"
     )
-    parser.add_argument("--workers", type=_positive, help="processes (default: one per core)")
-    parser.add_argument("--no-card", action="store_true", help="do not draw the data card at the end")
+    parser.add_argument("--workers", type=_positive, help="number of processes (default: one per core)")
+    parser.add_argument("--no-card", action="store_true", help="do not write the data card at the end")
     commands = parser.add_subparsers(metavar="verify | card | export")
 
-    command = commands.add_parser("verify", help="check all bytes of a finished folder")
+    command = commands.add_parser("verify", help="check the checksums of a finished folder")
     command.set_defaults(run=_verify)
     command.add_argument("dir", type=Path)
-    command.add_argument("--repair", action="store_true", help="make damaged trajectories again")
-    command.add_argument("--workers", type=_positive, help="processes (default: one per core)")
+    command.add_argument("--repair", action="store_true", help="generate damaged trajectories again")
+    command.add_argument("--workers", type=_positive, help="number of processes (default: one per core)")
 
-    command = commands.add_parser("card", help="write the data card: Markdown and pictures")
+    command = commands.add_parser("card", help="write the data card: Markdown and images")
     command.set_defaults(run=_card)
     command.add_argument("dir", type=Path)
     command.add_argument("--out", type=Path, help="folder for the page (default: DIR/card)")

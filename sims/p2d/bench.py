@@ -1,10 +1,10 @@
-"""How fast P2D is made, against the scene that one would write first: `python -m sims.p2d.bench`.
+"""Speed of P2D's simulation, compared with a straightforward scene: `python -m sims.p2d.bench`.
 
-The naive scene is one PyBullet server per process, loaded anew for every trajectory, with the Panda's own meshes, the
-scans at full resolution, PyBullet's plane and table, and one `getCameraImage` with shadows per frame. It goes through
-the same physics steps for the same specifications, but makes no amodal counts, which P2D's labels have: so the ratio
-says less than the whole. Both are measured in one process, turn by turn, in seconds of processor time as well as on the
-wall clock, because other work on the machine slows the second only.
+The naive scene is one PyBullet server per process, reset and loaded again for every trajectory, with the Panda's own
+meshes, the scans at full resolution, PyBullet's plane and table, and one `getCameraImage` with shadows per frame. It
+takes the same physics steps for the same specifications but computes no amodal counts, which P2D does, so the ratio
+understates the gain. Both are measured alternately in one process, in processor time and in wall-clock time, because
+other work on the machine slows only the latter.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Clock:
 
 
 class NaiveScene:
-    """Everything in one server, as the models come."""
+    """Physics and rendering in one server, with the original models."""
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
@@ -61,7 +61,7 @@ class NaiveScene:
         self.scans = {entry.name: str(scan_file(entry)) for entry in CATALOGUE}
 
     def play(self, spec: Spec) -> int:
-        """Load, settle, push and draw one trajectory; returns its number of frames."""
+        """Load, settle, push and render one trajectory; returns its number of frames."""
         call = self.bullet.call
         call("resetSimulation")
         call("setGravity", 0, 0, -9.81)
@@ -111,7 +111,7 @@ class NaiveScene:
 
 
 def measure(settings: Settings, trajectories: int) -> tuple[Clock, Clock]:
-    """Time the naive scene and P2D on the same trajectories, in turns; the first of each is not counted."""
+    """Time the naive scene and P2D alternately on the same trajectories; the first of each is warm-up."""
     naive, product = Clock(), Clock()
     scene = NaiveScene(settings)
 
@@ -129,10 +129,10 @@ def measure(settings: Settings, trajectories: int) -> tuple[Clock, Clock]:
 
 
 def main() -> None:
-    """Print the speeds, their ratio, and how long the whole data set takes."""
+    """Print the speeds, their ratio, and the time for the whole data set."""
     parser = argparse.ArgumentParser(prog="python -m sims.p2d.bench", description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--trajectories", type=int, default=12, help="how many to time (default 12)")
-    parser.add_argument("--image-size", type=int, default=128, help="side of the pictures in pixels (default 128)")
+    parser.add_argument("--trajectories", type=int, default=12, help="trajectories to time (default 12)")
+    parser.add_argument("--image-size", type=int, default=128, help="side of the images in pixels (default 128)")
     parser.add_argument("--renderer", choices=["tiny", "egl"], default="tiny", help="renderer of P2D (default tiny)")
     words = parser.parse_args()
     settings = Settings(image_size=words.image_size, renderer=words.renderer)
@@ -143,7 +143,7 @@ def main() -> None:
     print(f"{settings.image_size} x {settings.image_size}, {settings.frames} frames, {words.trajectories} trajectories")
     for name, clock in (("naive scene", naive), ("P2D", product)):
         wall = clock.frames / clock.wall_s
-        print(f"{name:12} {clock.per_core:6.1f} frames per second and core, {wall:6.1f} on the wall clock")
+        print(f"{name:12} {clock.per_core:6.1f} frames per second and core, {wall:6.1f} by the wall clock")
     print(f"ratio        {product.per_core / naive.per_core:6.1f}")
     whole = (settings.train + settings.val + settings.test) * settings.frames
     for cores in sorted({1, 2, os.cpu_count() or 1}):

@@ -1,4 +1,4 @@
-"""The data card: a Markdown page with pictures and numbers that shows what a P2D folder holds."""
+"""The data card: a Markdown page with samples and statistics of a P2D folder."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def write_card(root: Path, out: Path) -> Path:
     manifest = check(root)
     splits = [split for split in SPLITS if getattr(manifest.settings, split)]
     if not splits:
-        raise SimError(f"{root} holds no trajectory, so there is nothing to show")
+        raise SimError(f"{root} holds no trajectory, so it has no data card")
     stats = statistics(root, manifest, splits)
     page = out / PAGE
     try:
         out.mkdir(parents=True, exist_ok=True)
-        # JPEG for photographs: the page is small enough to be kept under version control.
+        # JPEG keeps the page small enough for version control.
         samples = draw.samples(manifest.classes, _crops(root, manifest, splits[0]))
         samples.save(out / "samples.jpg", quality=QUALITY, subsampling=0)
         draw.strips(_strips(root, manifest, splits[-1])).save(out / "strips.jpg", quality=QUALITY, subsampling=0)
@@ -50,7 +50,7 @@ def _arrays(root: Path, split: str) -> tuple[np.ndarray, ...]:
 
 
 def _crops(root: Path, manifest: Manifest, split: str) -> list[list[np.ndarray]]:
-    """Per class the views that show most of it, from different trajectories."""
+    """Per class, the least occluded views, from different trajectories."""
     rgb, segmentation, classes, visible, amodal, _ = _arrays(root, split)
     share = visible[..., 1:] / np.maximum(amodal[..., 1:], 1)
     found: list[list[np.ndarray]] = []
@@ -68,7 +68,7 @@ def _crops(root: Path, manifest: Manifest, split: str) -> list[list[np.ndarray]]
 
 
 def _strips(root: Path, manifest: Manifest, split: str) -> list[tuple[str, np.ndarray, np.ndarray]]:
-    """The first trajectories of a split, as they come."""
+    """The first trajectories of a split."""
     rgb, segmentation, classes, *_ = _arrays(root, split)
     videos = []
     for index in range(min(STRIPS, len(rgb))):
@@ -85,8 +85,8 @@ def _page(manifest: Manifest, stats: Stats, splits: list[str]) -> str:
     return f"""# Data card: P2D (re-creation)
 
 A simulated Panda arm moves along random straight lines over a table and pushes household objects. A re-creation of the
-Panda Pushing Dataset of the APEX paper, which was never released, from its description; no number here is the
-original's.
+Panda Pushing Dataset of the APEX paper, which was never released, from its description; all numbers are of the
+re-creation.
 
 | | |
 |---|---|
@@ -103,8 +103,8 @@ original's.
 {_calibration(stats)}
 
 Published: the scores of the collapsed models in the paper's ablation table, which depend on the data alone.
-The number of objects is uniform (the paper states no distribution): with everything in view,
-{(settings.min_objects + settings.max_objects) / 2 + 1:.1f} things per frame, the arm counted.
+The number of objects is uniform (the paper states no distribution): if all are visible,
+{(settings.min_objects + settings.max_objects) / 2 + 1:.1f} per frame, including the arm.
 
 | | |
 |---|---|
@@ -118,7 +118,7 @@ The number of objects is uniform (the paper states no distribution): with everyt
 
 ## Film strips
 
-The first trajectories of the {splits[-1]} split. Below each picture its masks: the arm yellow, objects by slot.
+The first trajectories of the {splits[-1]} split. Below each frame its masks: the arm yellow, objects by slot.
 
 ![film strips with masks](strips.jpg)
 
@@ -130,9 +130,9 @@ The first trajectories of the {splits[-1]} split. Below each picture its masks: 
 
 def _calibration(stats: Stats) -> str:
     rows = {
-        "visible_per_frame": "visible things per frame, the arm counted",
-        "one_segment_msc": "MSC of one segment for everything: mean of 1 / (visible + 1)",
-        "one_segment_msc_fg": "MSC-FG of the same: mean area share of what is visible",
+        "visible_per_frame": "visible objects per frame, including the arm",
+        "one_segment_msc": "MSC of a single segment: mean of 1 / (visible + 1)",
+        "one_segment_msc_fg": "MSC-FG of a single segment: mean area share of the visible objects",
     }
     lines = ["| | here | published |", "|---|---|---|"]
     lines += [f"| {text} | {getattr(stats, key):.3f} | {PUBLISHED[key]} |" for key, text in rows.items()]
@@ -149,7 +149,7 @@ def _numbers(stats: Stats) -> str:
         "area of a visible object": f"{_share(objects)} of the image",
         "area of the arm where visible": f"{_share(arm)} of the image",
         "frames that show the arm": f"{np.isfinite(arm).mean():.1%}",
-        "object-frames with the object out of sight": f"{(used & ~seen).sum() / max(used.sum(), 1):.1%}",
+        "object-frames with the object invisible": f"{(used & ~seen).sum() / max(used.sum(), 1):.1%}",
         "object-frames cut off by the image's border": f"{stats.cut[..., 1:].sum() / max(seen.sum(), 1):.1%}",
         "mean occlusion of objects": _share(hidden),
         "object-frames hidden by half or more": f"{(hidden >= 0.5).sum() / max(np.isfinite(hidden).sum(), 1):.1%}",
@@ -157,7 +157,7 @@ def _numbers(stats: Stats) -> str:
         f"… and moves it by {MOVED_M * 100:.0f} cm or more": f"{stats.pushed.mean():.1%}",
         "trajectories in which objects touch each other": f"{stats.collided.mean():.1%}",
         "lines aimed at an object": f"{stats.aimed.mean():.1%}",
-        "attempts drawn again": f"{stats.redraws.sum():,} of {tries:,} ({stats.redraws.sum() / tries:.1%})",
+        "attempts redrawn": f"{stats.redraws.sum():,} of {tries:,} ({stats.redraws.sum() / tries:.1%})",
     }
     return "\n".join(f"| {name} | {value} |" for name, value in rows.items())
 
@@ -175,6 +175,6 @@ def _classes(manifest: Manifest, stats: Stats) -> str:
 
 
 def _share(values: np.ndarray) -> str:
-    """Mean over what is not NaN, in per cent; a dash if nothing is left."""
+    """Mean of the finite values in per cent; a dash if there are none."""
     values = values[np.isfinite(values)]
     return f"{values.mean():.1%}" if values.size else "–"

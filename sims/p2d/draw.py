@@ -1,4 +1,4 @@
-"""Pictures of the data card: samples of every class, film strips with masks, histograms."""
+"""Figures of the data card: samples of every class, film strips with masks, histograms."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INK = (30, 30, 30)
 COLOURS = np.array(
     [(0, 0, 0), (255, 200, 0), (0, 150, 255), (235, 40, 130), (60, 190, 80), (150, 90, 220), (255, 120, 40)], np.uint8
 )
-"""By id; further ids begin again after the background's."""
+"""By id; further ids cycle through all but the background's."""
 
 
 def colour_of(identity: np.ndarray) -> np.ndarray:
@@ -29,7 +29,7 @@ def colour_of(identity: np.ndarray) -> np.ndarray:
 
 
 def overlay(rgb: np.ndarray, segmentation: np.ndarray) -> np.ndarray:
-    """(H, W, 3) picture, its foreground tinted by id with a solid outline and its background faded."""
+    """(H, W, 3) image: foreground tinted by id with a solid outline, background faded."""
     inner = segmentation.copy()
     for axis in (0, 1):
         for shift in (1, -1):
@@ -42,7 +42,7 @@ def overlay(rgb: np.ndarray, segmentation: np.ndarray) -> np.ndarray:
 
 
 def strips(videos: list[tuple[str, np.ndarray, np.ndarray]], columns: int = 8) -> Image.Image:
-    """Film strips: per video a row of pictures and below it the same with masks.
+    """Film strips: per video a row of frames, and below it the same frames with masks.
 
     Args:
         videos: title, rgb (T, H, W, 3), segmentation (T, H, W).
@@ -64,7 +64,7 @@ def strips(videos: list[tuple[str, np.ndarray, np.ndarray]], columns: int = 8) -
 
 
 def samples(names: list[str], crops: list[list[np.ndarray]], columns: int = 6) -> Image.Image:
-    """A row of pictures per class, two classes side by side; crops are (S, S, 3)."""
+    """A row of crops (S, S, 3) per class, two classes side by side."""
     label, wide = 124, columns * (TILE + GAP)
     rows = -(-len(names) // 2)
     page = Image.new("RGB", (2 * (label + wide) + GAP, rows * (TILE + GAP) + GAP), PAPER)
@@ -168,7 +168,7 @@ def _balance(axes: Axes, stats: Stats, names: list[str]) -> None:
 
 
 def crops_of(rgb: np.ndarray, segmentation: np.ndarray, identity: int) -> np.ndarray | None:
-    """A square part of one frame around one id with some room; None if the id is not there."""
+    """A square crop of one frame around one id, with a margin; None if the id is absent."""
     rows, columns = np.nonzero(segmentation == identity)
     if rows.size == 0:
         return None
@@ -187,7 +187,7 @@ def object_identity(slot: int) -> int:
 
 
 def legend(slots: list[str]) -> str:
-    """What the ids of one video are, for a strip's title."""
+    """Ids and names in one video, for a strip's title."""
     return ", ".join([f"{ARM_ID} arm", *(f"{object_identity(slot)} {name}" for slot, name in enumerate(slots))])
 
 

@@ -1,24 +1,25 @@
-"""Writes a P2D folder in the forms that other people's code reads: PNGs with COCO-style or MOTChallenge ground truth.
+"""Export of a P2D folder to common formats: PNGs with COCO-style or MOTChallenge ground truth.
 
 COCO-style, for instance segmentation (`pycocotools`):
 
 ```
-images/<split>/<video>/<frame>.png         video 6 digits, frame 5 digits, both from 0
+images/<split>/<video>/<frame>.png         frame 5 digits, from 0
 annotations/instances_<split>.json         one image per frame; run-length encoded masks; `video_id`, `track_id`
 ```
 
 MOTChallenge-style, for box trackers (`TrackEval`, `motmetrics`):
 
 ```
-P2D-<split>/P2D-<split>-<video>/img1/<frame>.png    frame 6 digits, from 1
-P2D-<split>/P2D-<split>-<video>/gt/gt.txt           frame, id, left, top, width, height, 1, 1, visibility; from 1
-P2D-<split>/P2D-<split>-<video>/gt/names.txt        id and class name of everything in the video
-P2D-<split>/P2D-<split>-<video>/seqinfo.ini
-seqmaps/P2D-<split>.txt                             names of the sequences
+P2D-<split>/<video>/img1/<frame>.png    frame 6 digits, from 1
+P2D-<split>/<video>/gt/gt.txt           frame, id, left, top, width, height, 1, 1, visibility; all from 1
+P2D-<split>/<video>/gt/names.txt        id and class name of the arm and each object in the video
+P2D-<split>/<video>/seqinfo.ini
+seqmaps/P2D-<split>.txt                 names of the videos
 ```
 
-The class column of gt.txt is 1 throughout, because evaluation kits for pedestrians ignore all other classes. In both,
-identities are the ids of the segmentation: 1 the arm, 2 and up the objects.
+A video is named as `video_name` says, <split>_<number>, as in predictions and results of `apex_lab`. The class column
+of gt.txt is always 1, because MOTChallenge evaluation ignores all other classes. In both formats, identities are the
+ids of the segmentation: 1 the arm, 2 and up the objects.
 """
 
 from __future__ import annotations
@@ -46,6 +47,11 @@ FRAME_RATE = 10
 """Nominal: frames are spread evenly over a push, whose duration varies."""
 
 
+def video_name(split: str, index: int) -> str:
+    """What a video is called in exports, predictions and results: its split and its number there, from 0."""
+    return f"{split}_{index:05d}"
+
+
 @dataclass(frozen=True)
 class Video:
     """One trajectory; T frames.
@@ -55,7 +61,7 @@ class Video:
         rgb: (T, H, W, 3) uint8.
         segmentation: (T, H, W) uint8.
         names: id -> class name.
-        visibility: (T, 1 + O) visible share of each thing, by id - 1.
+        visibility: (T, 1 + O) visible share of the arm and each object, indexed by id - 1.
     """
 
     index: int
@@ -66,7 +72,7 @@ class Video:
 
 
 def export(root: Path, out: Path, form: str, splits: Sequence[str], *, shown: bool = True) -> None:
-    """Writes the given splits to a new folder, whole or not at all.
+    """Writes the given splits to a new folder, atomically.
 
     Args:
         root: a finished P2D folder.
@@ -80,7 +86,7 @@ def export(root: Path, out: Path, form: str, splits: Sequence[str], *, shown: bo
     """
     manifest = check(root, splits=splits)
     if out.exists():
-        raise SimError(f"{out} exists already: name a folder that does not")
+        raise SimError(f"{out} exists already: choose another folder")
     draft = out.with_name(f".{out.name}.unfinished")
     shutil.rmtree(draft, ignore_errors=True)
     total = sum(getattr(manifest.settings, split) for split in splits) * manifest.settings.frames
@@ -118,7 +124,7 @@ def _coco(out: Path, split: str, videos: Iterator[Video], manifest: Manifest) ->
     described: list[dict[str, Any]] = []
     (out / "annotations").mkdir(exist_ok=True)
     for video in videos:
-        folder = Path("images", split, f"{video.index:06d}")
+        folder = Path("images", split, video_name(split, video.index))
         (out / folder).mkdir(parents=True)
         described.append({"id": video.index, "name": folder.name, "width": size, "height": size, "length": frames})
         for frame, picture in enumerate(video.rgb):
@@ -164,7 +170,7 @@ def _mot(out: Path, split: str, videos: Iterator[Video], manifest: Manifest) -> 
     (out / "seqmaps").mkdir(exist_ok=True)
     sequences = []
     for video in videos:
-        name = f"{benchmark}-{video.index:06d}"
+        name = video_name(split, video.index)
         sequences.append(name)
         folder = out / benchmark / name
         for part in ("img1", "gt"):
@@ -197,4 +203,4 @@ WRITERS: dict[str, Callable[[Path, str, Iterator[Video], Manifest], None]] = {"c
 
 def _write_png(path: Path, rgb: np.ndarray) -> None:
     _, code = cv2.imencode(".png", rgb[..., ::-1])
-    path.write_bytes(code.tobytes())  # unlike OpenCV's own writing, this says when the disk is full
+    path.write_bytes(code.tobytes())  # unlike cv2.imwrite, this raises on a full disk

@@ -1,4 +1,4 @@
-"""Makes a P2D folder: from nothing, from where a kill or a full disk stopped it, or only what is damaged in it."""
+"""Generates a P2D folder, resumes an interrupted generation, or repairs a damaged folder."""
 
 from __future__ import annotations
 
@@ -50,21 +50,21 @@ def generate(
     simulator: str = SIMULATOR,
     recycle: int = RECYCLE,
 ) -> Manifest:
-    """Makes sure that `root` holds the whole data set with these settings; does only what is not done yet.
+    """Generates the data set with these settings in `root`; finished trajectories are kept.
 
     The bytes depend on the settings and the versions of the simulator alone: not on the number of workers, the order
-    in which they finish, or interruptions. A second process that wants the same folder waits for the first.
+    in which they finish, or interruptions. A second process with the same folder waits for the first.
 
     Args:
         root: the folder; made if it does not exist.
-        settings: what to make.
+        settings: settings of the data set.
         workers: number of processes; None: one per core.
         shown: whether progress is shown on stderr.
         simulator: module that simulates (tests bring their own).
         recycle: trajectories after which a worker is replaced.
 
     Raises:
-        SimError: the folder holds something else, the disk is full, the simulator is missing or keeps dying.
+        SimError: the folder has other content, the disk is full, the simulator is missing or its workers keep dying.
     """
     root = root.absolute()
     if (root / MANIFEST).exists():
@@ -83,13 +83,13 @@ def repair(
     shown: bool = True,
     simulator: str = SIMULATOR,
 ) -> Damage:
-    """Checks a folder fully and makes its damaged trajectories, and only those, again; returns what was damaged.
+    """Checks a folder fully and generates its damaged trajectories, and only those, again; returns the damage found.
 
-    A trajectory is written only if it has the bytes it had when the data were made, so nothing that is right is ever
-    replaced by something else, and a repair that is killed can simply be started again.
+    A trajectory is written only if its checksum is the recorded one, so intact data are never replaced by other data,
+    and a killed repair can be started again.
 
     Raises:
-        SimError: as `generate`; also if a trajectory comes out with other bytes than it had.
+        SimError: as `generate`; also if a trajectory does not have its recorded checksum.
     """
     root = root.absolute()
     if not root.is_dir():
@@ -100,7 +100,10 @@ def repair(
         except DamagedManifestError as error:
             found = read_journal(root)
             if found is None:
-                raise SimError(f"{root / MANIFEST} is damaged and {JOURNAL} is missing: make the data anew") from None
+                raise SimError(
+                    f"{root / MANIFEST} is damaged and {JOURNAL} is missing: delete the folder and generate the data "
+                    "again"
+                ) from None
             (root / MANIFEST).unlink()
             _complete(root, found[0], workers or cores(), shown, simulator, RECYCLE)
             return Damage([str(error).split(":")[0]])
@@ -117,7 +120,7 @@ def cores() -> int:
 
 @contextmanager
 def _locked(root: Path) -> Iterator[None]:
-    """Only one process at a time writes in a folder; waits, saying so, for another one. Names failed writes."""
+    """Locks the folder, with a message if another process holds the lock; turns failed writes into `SimError`."""
     lock = FileLock(root / LOCK)
     try:
         try:
@@ -134,25 +137,25 @@ def _locked(root: Path) -> Iterator[None]:
 
 
 def _claim(root: Path) -> None:
-    """Makes the folder; refuses one that holds something else."""
+    """Creates the folder; refuses one with other content."""
     try:
         root.mkdir(parents=True, exist_ok=True)
         strange = [path.name for path in root.iterdir() if not path.name.startswith(".")]
     except OSError as error:
         raise SimError(f"{root} cannot be used as a folder ({error.strerror}): choose another") from None
     if strange and not (root / JOURNAL).exists():
-        raise SimError(f"{root} holds something that is not P2D ({sorted(strange)[0]}): choose an empty folder")
+        raise SimError(f"{root} contains files that are not P2D ({sorted(strange)[0]}): choose an empty folder")
 
 
 def _complete(root: Path, settings: Settings, workers: int, shown: bool, simulator: str, recycle: int) -> Manifest:
-    """Makes what is missing or wrong and finishes the folder. Called under the lock, while there is no manifest."""
+    """Generates missing and damaged trajectories and finishes the folder. Needs the lock and no manifest."""
     facts: Facts | None = None
     records: dict[Key, Record] = {}
     found = read_journal(root)
     if found is not None:
         there, facts, records = found
         if what := difference(there, settings):
-            raise SimError(f"{root} was begun with other settings ({what}): choose another folder or delete this one")
+            raise SimError(f"{root} was started with other settings ({what}): choose another folder or delete this one")
         allocate(root, settings)
         for key in mismatches(root, settings, records, shown=shown):
             del records[key]
@@ -169,7 +172,7 @@ def _complete(root: Path, settings: Settings, workers: int, shown: bool, simulat
                     records[key] = record
     manifest = Manifest(settings, facts, records, fingerprint(settings))
     _sync(root, manifest, missing)
-    Journal(root, settings, facts, records).close()  # in order, so that equal data have equal journals
+    Journal(root, settings, facts, records).close()  # in storage order, so that equal data have equal journals
     write_at_once(root / README, readme(manifest))
     write_manifest(root, manifest)
     note_verified(root, manifest)
@@ -177,7 +180,7 @@ def _complete(root: Path, settings: Settings, workers: int, shown: bool, simulat
 
 
 def _remake(root: Path, manifest: Manifest, bad: list[Key], workers: int, shown: bool, simulator: str) -> None:
-    """Mends files' headers and sizes and makes the given trajectories of a finished folder again."""
+    """Repairs the headers and sizes of a finished folder's files and generates the given trajectories again."""
     settings = manifest.settings
     allocate(root, settings)
     if bad:
@@ -198,13 +201,13 @@ def _made(root: Path, settings: Settings, pool: Pool, tasks: list[Task], shown: 
 
 
 def _agreed(root: Path, begun: Facts | None, here: Facts) -> Facts:
-    """What the simulator says here; refuses to go on with a folder begun by another version of it."""
+    """The facts of the simulator here; refuses to resume a folder that was started with other versions."""
     for name, version in (begun or here)["versions"].items():
         other = here["versions"].get(name)
         if other != version:
             raise SimError(
-                f"{root} was begun with {name} {version} and here is {name} {other}: install that version or delete "
-                "the folder and make the data anew"
+                f"{root} was started with {name} {version} and here is {name} {other}: install that version, or delete "
+                "the folder and generate the data again"
             )
     return here
 
@@ -213,13 +216,13 @@ def _allocate_or_leave_nothing(root: Path, settings: Settings) -> None:
     try:
         allocate(root, settings)
     except SimError:
-        for split in SPLITS:  # a full disk is not made fuller by empty arrays
+        for split in SPLITS:  # empty arrays would only take up space on a full disk
             shutil.rmtree(root / split, ignore_errors=True)
         raise
 
 
 def _sync(root: Path, manifest: Manifest, made: list[Key]) -> None:
-    """Brings all arrays to the disk and reads what was just made back."""
+    """Syncs all arrays to the disk and verifies the given trajectories."""
     for split in SPLITS:
         with closing(Arrays(root, split, manifest.settings, writable=True)) as arrays:
             arrays.sync()
@@ -227,6 +230,6 @@ def _sync(root: Path, manifest: Manifest, made: list[Key]) -> None:
     bad = mismatches(root, manifest.settings, {key: manifest.records[key] for key in made}, shown=False)
     if bad:
         raise SimError(
-            f"{root} does not give back what was written (trajectory {bad[0][0]}/{bad[0][1]} and {len(bad) - 1} more): "
-            "see to that disk and give the same command again"
+            f"{root} reads back other bytes than were written (trajectory {bad[0][0]}/{bad[0][1]} and {len(bad) - 1} "
+            "more): check that disk and run the same command again"
         )

@@ -1,4 +1,4 @@
-"""What a P2D folder says about itself: the manifest of a finished one, the journal of one in the making."""
+"""Metadata of a P2D folder: the manifest of a finished one, the journal of an unfinished one."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ MANIFEST = "manifest.json"
 JOURNAL = "trajectories.jsonl"
 
 SIMULATION_VERSION = 1
-"""Raise whenever the simulation gives other bytes for the same settings: old data are then made anew, not mixed in."""
+"""Raise whenever the simulation gives other bytes for the same settings, so that old and new data are not mixed."""
 
 Facts = dict[str, Any]
-"""What the simulator says about itself: `versions` (name -> version of all that decides bytes), `camera`, `classes`."""
+"""Facts of the simulator: `versions` (name -> version of everything that determines bytes), `camera`, `classes`."""
 
 
 class DamagedManifestError(SimError):
-    """The manifest is there but is not what was written."""
+    """The manifest exists but does not match its checksum."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """One finished trajectory: the checksum of its bytes, how many attempts were thrown away before it."""
+    """A finished trajectory: the checksum of its bytes, the number of attempts rejected before it."""
 
     checksum: str
     redraws: int
@@ -40,9 +40,9 @@ class Record:
 
 @dataclass(frozen=True)
 class Manifest:
-    """Everything about a finished data set but its arrays.
+    """Everything about a finished data set except its arrays.
 
-    Nothing here depends on when, where or by how many processes the data were made: equal data have equal manifests.
+    It does not depend on when, where or by how many processes the data were generated: equal data have equal manifests.
     """
 
     settings: Settings
@@ -52,19 +52,19 @@ class Manifest:
 
     @property
     def content(self) -> str:
-        """Of what was made: 32 hex digits over all trajectories' checksums; equal only for equal bytes."""
+        """32 hex digits over all trajectories' checksums; equal only for equal bytes."""
         return _digest([self.records[key].checksum for key in keys(self.settings)])
 
     @property
     def classes(self) -> list[str]:
-        """Names of the object catalogue, the meaning of array `classes`."""
+        """Class names, indexed by the values of array `classes`."""
         return list(self.facts["classes"])
 
 
 def fingerprint(settings: Settings) -> str:
-    """16 hex digits of what decides the bytes as far as one can wish it: settings, versions of simulation and format.
+    """16 hex digits over the settings and the versions of simulation and format.
 
-    Package versions stand in the manifest instead (`facts["versions"]`), because prepared data must be found by their
+    Package versions are in the manifest instead (`facts["versions"]`), because prepared data must be found by their
     settings on machines without the simulator too.
     """
     wish = {"format": FORMAT_VERSION, "simulation": SIMULATION_VERSION, "settings": settings.model_dump(mode="json")}
@@ -117,7 +117,7 @@ def read_manifest(root: Path) -> Manifest:
 
 
 def write_manifest(root: Path, manifest: Manifest) -> None:
-    """Writes the manifest at once or not at all; from then on the folder counts as finished."""
+    """Writes the manifest atomically; from then on the folder counts as finished."""
     settings = manifest.settings
     data: dict[str, Any] = {
         "format": FORMAT_VERSION,
@@ -141,13 +141,13 @@ def write_manifest(root: Path, manifest: Manifest) -> None:
 
 
 class Journal:
-    """`trajectories.jsonl`: a first line with what is being made, then one line per finished trajectory.
+    """`trajectories.jsonl`: a first line with settings and facts, then one line per finished trajectory.
 
-    One process writes it, under the folder's lock. Unreadable lines are skipped: their trajectories are made again.
+    One process writes it, under the folder's lock. Trajectories with unreadable lines are generated again.
     """
 
     def __init__(self, root: Path, settings: Settings, facts: Facts, records: Mapping[Key, Record]) -> None:
-        """Writes a new journal in place of an old one."""
+        """Writes a new journal, replacing an old one."""
         self.path = root / JOURNAL
         head = {"format": FORMAT_VERSION, "settings": settings.model_dump(mode="json"), **facts}
         order = [key for key in keys(settings) if key in records]
@@ -156,9 +156,9 @@ class Journal:
         self.file = os.open(self.path, os.O_WRONLY | os.O_APPEND)
 
     def append(self, key: Key, record: Record) -> None:
-        """Notes that a trajectory's bytes have been written."""
+        """Records that a trajectory's bytes have been written."""
         line = (_line(key, record) + "\n").encode()
-        if os.write(self.file, line) != len(line):  # a disk that fills up takes a part and refuses the rest
+        if os.write(self.file, line) != len(line):  # a disk that fills up accepts a part of the line
             os.write(self.file, b"\n")
 
     def close(self) -> None:
@@ -183,7 +183,7 @@ def read_journal(root: Path) -> tuple[Settings, Facts, dict[Key, Record]] | None
         settings = _settings(root, data["settings"])
         facts = {name: data[name] for name in ("versions", "camera", "classes")}
     except (ValueError, KeyError, TypeError):
-        raise SimError(f"the first line of {path} is damaged: delete {root} and make the data anew") from None
+        raise SimError(f"the first line of {path} is damaged: delete {root} and generate the data again") from None
     known = set(keys(settings))
     records = {}
     for line in lines:
@@ -198,7 +198,7 @@ def read_journal(root: Path) -> tuple[Settings, Facts, dict[Key, Record]] | None
 
 
 def write_at_once(path: Path, text: str) -> None:
-    """Writes a small file so that it is either there whole and on the disk, or not changed at all."""
+    """Writes a small file atomically and syncs it to the disk."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         with open(draft, "w", encoding="utf-8") as file:
@@ -212,7 +212,7 @@ def write_at_once(path: Path, text: str) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Brings a folder's entries to the disk."""
+    """Syncs a folder's entries to the disk."""
     folder = os.open(path, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -234,8 +234,8 @@ def _settings(root: Path, data: Any) -> Settings:
         return Settings.model_validate_json(json.dumps(data))
     except ValidationError:
         raise SimError(
-            f"{root} was made by another version of this program (its settings are not known here): "
-            "make the data anew in another folder with python -m sims.p2d --out"
+            f"{root} was made by another version of this program (its settings are unknown here): "
+            "generate the data again in another folder with python -m sims.p2d --out"
         ) from None
 
 
@@ -244,15 +244,15 @@ def _why_missing(root: Path) -> str:
     if found is None:
         return f"no P2D data at {root}: make them with python -m sims.p2d --out {root}"
     made, wanted = len(found[2]), len(keys(found[0]))
-    return f"{root} is not finished ({made} of {wanted} trajectories made): go on with python -m sims.p2d --out {root}"
+    return f"{root} is not finished ({made} of {wanted} trajectories made): resume with python -m sims.p2d --out {root}"
 
 
 def _other_format(root: Path, found: object) -> str:
     return (
         f"{root} was written in format {found!r} and this program reads format {FORMAT_VERSION}: "
-        "make the data anew in another folder with python -m sims.p2d --out"
+        "generate the data again in another folder with python -m sims.p2d --out"
     )
 
 
 def _damaged(path: Path) -> DamagedManifestError:
-    return DamagedManifestError(f"{path} is damaged: mend it with python -m sims.p2d verify {path.parent} --repair")
+    return DamagedManifestError(f"{path} is damaged: repair it with python -m sims.p2d verify {path.parent} --repair")

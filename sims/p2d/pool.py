@@ -1,4 +1,4 @@
-"""Several worker processes that make trajectories, watched: one that dies is replaced, its trajectory made again."""
+"""A pool of worker processes that generate trajectories; a dead worker is replaced and its trajectory retried."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sims.p2d.settings import Settings
 from sims.p2d.store import Key, no_room
 
 TRIES = 3
-"""How often a trajectory (or the start of a worker) may end with the death of its worker."""
+"""Attempts at a trajectory (or at the start of a worker) before the death of its worker becomes an error."""
 
 RECYCLE = 200
 """Trajectories after which a worker is replaced: the physics engine's memory grows with every reset."""
@@ -27,14 +27,14 @@ RECYCLE = 200
 
 @dataclass(frozen=True)
 class Task:
-    """One trajectory to make; with `expected` it is written only if its checksum is that one."""
+    """A trajectory to generate; with `expected`, it is written only if it has that checksum."""
 
     key: Key
     expected: str | None = None
 
 
 class Pool:
-    """Worker processes for one folder. Use as a context manager: on leaving, whatever happened, no worker is left."""
+    """Worker processes for one folder. A context manager: all workers have ended when it exits."""
 
     def __init__(self, root: Path, settings: Settings, simulator: str, workers: int, recycle: int = RECYCLE) -> None:
         self.job = (str(root), settings.model_dump_json(), simulator)
@@ -54,7 +54,7 @@ class Pool:
         self.workers = {}
 
     def start(self) -> Facts:
-        """Starts the first worker; returns what the simulator says about itself.
+        """Starts the first worker; returns the facts of the simulator.
 
         Raises:
             SimError: the simulator is not installed or cannot start.
@@ -67,10 +67,10 @@ class Pool:
         return self.facts
 
     def run(self, tasks: Iterable[Task]) -> Iterator[tuple[Key, Record]]:
-        """Makes all trajectories; yields each when its bytes have been written, in the order in which they finish.
+        """Generates all trajectories; yields each when its bytes have been written, in the order in which they finish.
 
         Raises:
-            SimError: a trajectory cannot be made, is not what was expected, or there is no room on the disk.
+            SimError: a trajectory cannot be generated or has another checksum than expected, or the disk is full.
         """
         queue = deque(tasks)
         left = len(queue)
@@ -91,7 +91,7 @@ class Pool:
         self.workers[worker.connection] = worker
 
     def _messages(self) -> Iterator[tuple[_Worker, tuple[Any, ...] | None]]:
-        """Waits for workers; yields each that has something to say with its message, None for a dead one's."""
+        """Waits for messages; yields each with its worker, or None as the message of a dead worker."""
         for connection in wait(list(self.workers)):
             worker = self.workers[connection]  # type: ignore[index]
             try:
@@ -103,7 +103,7 @@ class Pool:
         self, worker: _Worker, message: tuple[Any, ...] | None, queue: deque[Task]
     ) -> tuple[Key, Record] | None:
         if message is None:
-            self._bury(worker, queue)
+            self._replace(worker, queue)
             return None
         kind, *content = message
         if kind == "ready":
@@ -119,7 +119,7 @@ class Pool:
         if kind == "differs":
             raise SimError(
                 f"trajectory {_name(task.key)} came out with other bytes than those recorded in {self.root}: it was "
-                "made with other versions or on another kind of processor; repair it there, or make the data anew"
+                "made with other versions or on another kind of processor; repair it there, or generate the data again"
             )
         if worker.made >= self.recycle:
             del self.workers[worker.connection]
@@ -127,8 +127,8 @@ class Pool:
             worker.end()
         return task.key, Record(checksum=content[0], redraws=content[1])
 
-    def _bury(self, worker: _Worker, queue: deque[Task]) -> None:
-        """A worker died: puts its trajectory back in front, unless it has cost too many workers already."""
+    def _replace(self, worker: _Worker, queue: deque[Task]) -> None:
+        """Removes a dead worker and puts its trajectory at the front of the queue, or raises after `TRIES` deaths."""
         del self.workers[worker.connection]
         code = worker.end()
         key = worker.task.key if worker.task else None
@@ -136,7 +136,7 @@ class Pool:
         if self.deaths[key] >= TRIES:
             what = f"making trajectory {_name(key)}" if key else "starting"
             raise SimError(
-                f"a simulation worker died {TRIES} times while {what} ({_cause(code)}): {worker.last_words()}"
+                f"a simulation worker died {TRIES} times while {what} ({_cause(code)}): {worker.last_line()}"
             )
         if worker.task:
             queue.appendleft(worker.task)
@@ -186,7 +186,7 @@ class _Worker:
         try:
             self.connection.send(message)
         except OSError:
-            return  # it is dead; reading from it will say so
+            return  # the worker is dead: the next read from it returns None
 
     def stop(self) -> None:
         """Asks the process to end."""
@@ -195,7 +195,7 @@ class _Worker:
             self.process.terminate()
 
     def end(self) -> int:
-        """Waits for the end of the process, helping it along if need be; returns its exit code."""
+        """Waits for the process to end, killing it after 5 seconds; returns its exit code."""
         try:
             code = self.process.wait(timeout=5)
         except subprocess.TimeoutExpired:
@@ -204,7 +204,7 @@ class _Worker:
         self.connection.close()
         return code
 
-    def last_words(self) -> str:
+    def last_line(self) -> str:
         """The last line that the process printed."""
         self.log.seek(0)
         lines = self.log.read().decode(errors="replace").strip().splitlines()

@@ -1,4 +1,4 @@
-"""The README.md that lies in every P2D folder."""
+"""The README.md in every P2D folder."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sims.p2d.store import FIELDS, FORMAT_VERSION, SPLITS, item_shape
 README = "README.md"
 
 MEANINGS = {
-    "rgb": "pictures",
+    "rgb": "frames",
     "segmentation": "0 background, 1 arm, 2 + o object slot o; from the same render as `rgb`",
     "depth": "metres along the optical axis",
     "classes": "index into `classes` of the manifest; -1 for an unused slot",
@@ -18,16 +18,16 @@ MEANINGS = {
     "joints": "seven joint angles in radians, two finger positions in metres",
     "gripper": "pose of the gripper, as `poses`",
     "visible_px": "visible pixels of the arm (0) and of object slot o (1 + o)",
-    "amodal_px": "pixels each would cover if nothing stood in front of it, inside the picture",
+    "amodal_px": "pixels each would cover without occlusion, within the image",
     "arm_contact": "the arm touched the object since the frame before",
     "object_contact": "likewise between two objects",
-    "aimed": "the line was drawn so that it meets an object",
-    "redraws": "attempts thrown away before this one",
+    "aimed": "the line was sampled to meet an object",
+    "redraws": "attempts rejected before this one",
 }
 
 
 def readme(manifest: Manifest) -> str:
-    """Markdown: what the data are, every array with type, shape and meaning, how to read them."""
+    """Markdown: a description of the data, type, shape and meaning of every array, and how to read them."""
     settings = manifest.settings
     rows = "\n".join(
         f"| `{name}.npy` | {np.dtype(field.dtype).name} | {_shape(item_shape(settings, name))} | {MEANINGS[name]} |"
@@ -36,12 +36,12 @@ def readme(manifest: Manifest) -> str:
     splits = "\n".join(f"| {split} | {getattr(settings, split)} |" for split in SPLITS)
     return f"""# P2D, the Panda Pushing Dataset (re-creation)
 
-A simulated Panda arm pushes household objects over a table. A re-creation, after the description in the APEX paper
+A simulated Panda arm pushes household objects over a table. A re-creation, from the description in the APEX paper
 (Wu, Jones, Engelcke, Posner: APEX: Unsupervised, Object-Centric Scene Segmentation and Tracking for Robot
-Manipulation), of a data set that was never released; its numbers are its own.
+Manipulation), of a data set that was never released.
 
 Format {FORMAT_VERSION}, fingerprint {manifest.fingerprint}, content {manifest.content}, renderer `{settings.renderer}`.
-All settings, versions, the camera and a checksum per trajectory stand in `manifest.json`.
+All settings, versions, the camera and a checksum per trajectory are in `manifest.json`.
 
 | split | trajectories (N) |
 |---|---|
@@ -64,8 +64,8 @@ item = P2D(".", "{_first(manifest)}")[0]
 item["video"], item["segmentation"]  # uint8 (T, 3, H, W), uint8 (T, H, W)
 ```
 
-Check all bytes with `python -m sims.p2d verify .`, mend them with `--repair`; `python -m sims.p2d card .` draws the
-data card, `python -m sims.p2d export . --format coco` (or `mot`) writes what other people's code reads.
+`python -m sims.p2d verify .` checks all bytes, `--repair` generates damaged trajectories again; `python -m sims.p2d
+card .` writes the data card, `python -m sims.p2d export . --format coco` (or `mot`) exports to a common format.
 """
 
 

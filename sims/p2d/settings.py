@@ -1,4 +1,4 @@
-"""Everything that decides the bytes of a P2D data set."""
+"""Settings that determine the bytes of a P2D data set."""
 
 from __future__ import annotations
 
@@ -31,24 +31,24 @@ class Settings(BaseModel):
     min_objects: int = Field(default=1, ge=1, le=14)
     max_objects: int = Field(default=3, ge=1, le=14)
     aim: float = Field(default=0.5, ge=0, le=1)
-    """Share of lines drawn so that they meet an object."""
+    """Share of lines sampled to meet an object."""
     renderer: Literal["tiny", "egl"] = "tiny"
-    """'tiny' draws on the CPU, everywhere alike; 'egl' draws on a GPU, and its pictures differ."""
+    """'tiny' renders on the CPU, 'egl' on a GPU; their images differ."""
     camera: Camera = Camera()
     objects: Names = tuple(entry.name for entry in CATALOGUE)
-    """Classes to draw from, without repetition within a trajectory."""
+    """Classes to sample from, without repetition within a trajectory."""
     objects_root: str | None = None
-    """Folder of textured models, one sub-folder per object with an OBJ and its PNG; None: textures drawn here."""
+    """Folder of textured models, one sub-folder per object with an OBJ and its PNG; None: procedural textures."""
     workspace_x: Span = (0.39, 0.65)
-    """Where objects are put and lines run, metres in front of the robot's base."""
+    """Workspace of objects and lines: metres in front of the robot's base."""
     workspace_y: Span = (-0.17, 0.12)
-    """Likewise to its left."""
+    """Metres to the left of the robot's base."""
     height_m: float = Field(default=0.012, ge=0.01, le=0.2)
-    """Of the point between the fingertips, which end 7 mm lower, above the table."""
+    """Height above the table of the point between the fingertips, whose lower ends are 7 mm below it."""
     speed_m_s: float = Field(default=0.15, gt=0, le=0.5)
-    """Of the gripper along its line."""
+    """Speed of the gripper along its line."""
     max_redraws: int = Field(default=100, ge=0)
-    """Attempts at one trajectory before giving up with an error."""
+    """Rejected attempts at one trajectory before it is an error."""
 
     @model_validator(mode="after")
     def _check(self) -> Settings:

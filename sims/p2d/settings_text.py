@@ -1,4 +1,4 @@
-"""Settings from and to words `key=value`, and what is wrong with them in one sentence."""
+"""Settings from and to `key=value` arguments, with error messages of one sentence."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class SettingsError(SimError):
 
 
 def settings_from(words: list[str], base: Settings | None = None) -> Settings:
-    """Settings from words `key=value`; a value is JSON where it can be, else text; dots reach into nested settings.
+    """Settings from `key=value` arguments; a value is JSON if it parses, else text; dots select nested settings.
 
     Raises:
         SettingsError: an unknown key or an impossible value, in one sentence.
@@ -38,7 +38,7 @@ def settings_from(words: list[str], base: Settings | None = None) -> Settings:
         for parent in parents:
             place = place.setdefault(parent, {})
             if not isinstance(place, dict):
-                raise SettingsError(f"--set {word}: {parent} has no settings inside")
+                raise SettingsError(f"--set {word}: {parent} has no nested settings")
         place[name] = value
     try:
         return Settings.model_validate_json(json.dumps(data))
@@ -47,11 +47,11 @@ def settings_from(words: list[str], base: Settings | None = None) -> Settings:
 
 
 def _no_number(word: str) -> None:
-    raise ValueError(word)  # NaN and Infinity stay text, which no setting takes
+    raise ValueError(word)  # NaN and Infinity stay text, which no setting accepts
 
 
 def sentence(error: ValidationError) -> str:
-    """The first finding of a failed validation as one sentence that names the key, the value and the remedy."""
+    """The first error of a failed validation as one sentence with the key, the value and the remedy."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
@@ -68,7 +68,7 @@ def sentence(error: ValidationError) -> str:
 
 
 def command_words(settings: Settings) -> str:
-    """The `--set` part of the command that makes data with these settings; empty for the defaults."""
+    """The `--set` part of the command that generates data with these settings; empty for the defaults."""
     default = Settings()
     words = [
         f"{name}={json.dumps(value)}"

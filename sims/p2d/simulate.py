@@ -1,4 +1,4 @@
-"""One pushing episode: physics first, then pictures and labels from the recorded poses alone."""
+"""One pushing episode: physics first, then images and labels from the recorded poses alone."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sims.render import Renderer
 from sims.world import STEPS_PER_S, World
 
 CROWDED = 15
-"""When so many attempts from the first on found no room for the objects, the settings are called impossible."""
+"""If this many first attempts all find no room for the objects, the settings are refused as impossible."""
 SETTLE_S = 1.5
 REST_M_S, REST_RAD_S = 0.005, 0.05
 REST_STEPS = 24
@@ -30,18 +30,18 @@ WAYPOINT_M = 0.06
 REACH_ERROR_M = 0.001
 START_GAP_M = 0.01
 IN_PICTURE = 0.9
-"""Least share of an object's vertices within the picture's border, in every frame."""
+"""Minimum share of an object's vertices inside the image, in every frame."""
 STILL_M, STILL_RAD = 1e-4, 1e-3
-"""An object that moved less than this since its last recorded pose keeps that pose: what rests is exactly at rest."""
+"""An object that moved less than this since its last recorded pose keeps that pose: no jitter at rest."""
 
 
 class Unusable(Exception):
-    """This attempt makes no trajectory; draw another."""
+    """This attempt is rejected; sample another."""
 
 
 @dataclass(frozen=True)
 class Episode:
-    """What physics gave, frame by frame: float32 arrays as in `Trajectory`, for the used slots only."""
+    """Result of the physics, frame by frame: float32 arrays as in `Trajectory`, for the used slots only."""
 
     poses: np.ndarray
     joints: np.ndarray
@@ -80,7 +80,7 @@ def camera(settings: Settings) -> dict[str, object]:
 
 
 def simulate(settings: Settings, split: str, index: int) -> Trajectory:
-    """Make one trajectory; its bytes depend on the settings, the split's name and the index alone.
+    """Generate one trajectory; its bytes depend on the settings, the split's name and the index alone.
 
     Raises:
         SimError: PyBullet or a model is missing, the objects find no room, or no attempt within `max_redraws` was
@@ -148,7 +148,7 @@ def _path(world: World, spec: Spec) -> np.ndarray:
 
 
 def duration_s(settings: Settings, spec: Spec) -> float:
-    """How long the push takes."""
+    """Duration of the push."""
     return float(np.linalg.norm(np.subtract(spec.end, spec.start))) / settings.speed_m_s + RAMP_S
 
 
@@ -205,7 +205,7 @@ def _record(settings: Settings, world: World, path: np.ndarray, models: tuple[Ob
 
 
 def _steady(poses: np.ndarray, before: np.ndarray | None) -> np.ndarray:
-    """Poses (O, 7), with the pose before where an object has not really moved."""
+    """Poses (O, 7), with the previous pose for objects that have not moved."""
     if before is None:
         return poses
     shift = np.linalg.norm(poses[:, :3] - before[:, :3], axis=1)
@@ -222,11 +222,11 @@ def _check(settings: Settings, poses: np.ndarray, models: list[ObjectModel]) -> 
         pixels, _ = settings.camera.project(points, settings.image_size)
         inside = (pixels >= 0).all(axis=1) & (pixels < settings.image_size).all(axis=1)
         if inside.mean() < IN_PICTURE:
-            raise Unusable("an object left the picture")
+            raise Unusable("an object left the image")
 
 
 def _label(settings: Settings, spec: Spec, episode: Episode, models: tuple[ObjectModel, ...]) -> Trajectory:
-    """Draw every frame of an episode and pad the slots.
+    """Render every frame of an episode and pad the slots.
 
     Raises:
         Unusable: an object is hidden, or nearly so, in all frames.

@@ -1,4 +1,4 @@
-"""The real simulator in the form in which `generate` takes one."""
+"""The PyBullet simulator, with the interface that `generate` expects."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["facts", "simulate"]
 
 
 def facts(settings: Settings) -> Facts:
-    """Versions of all that decides the bytes besides the settings, the camera, names of the classes."""
+    """Versions of everything besides the settings that determines the bytes, the camera, the class names."""
     versions = {
         "simulation": str(SIMULATION_VERSION),
         "models": str(assets.FORMAT),
@@ -28,7 +28,7 @@ def facts(settings: Settings) -> Facts:
 
 
 def _digest(folder: Path) -> str:
-    """Of names and bytes of all files in a folder of models."""
+    """Digest of the names and bytes of all files in a folder of models."""
     digest = hashlib.blake2b(digest_size=8)
     for path in sorted(folder.rglob("*")):
         if path.is_file():

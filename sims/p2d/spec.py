@@ -1,4 +1,4 @@
-"""What a trajectory is going to be, as pure data drawn from (seed, split, index, attempt) alone."""
+"""The specification of a trajectory, sampled from (seed, split, index, attempt) alone."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from sims.outlines import cover
 from sims.p2d.settings import Settings
 
 MARGIN_M = 0.015
-"""Least distance between the footprints of two objects, and of an object and the gripper at its start."""
+"""Minimum distance between the footprints of two objects, and of an object and the gripper at its start."""
 GRIPPER_M = (0.07, 0.21)
-"""Footprint of the hand along and across its fingers' closing plane."""
+"""Footprint of the hand: along and across the fingers' closing plane."""
 YAW_RAD = 0.6
-"""The gripper is turned by at most this about the vertical."""
+"""Maximum yaw of the gripper."""
 MIN_LINE_M = 0.2
 LINE_MARGIN_M = 0.06
-"""Lines may leave the objects' workspace by this."""
+"""Lines may extend beyond the objects' workspace by this."""
 RUN_UP_M = (0.12, 0.24)
 RUN_ON_M = (0.06, 0.16)
-"""How far before and behind the middle of its target an aimed line starts and ends."""
+"""Distance of an aimed line's start before, and of its end behind, the centre of its target."""
 BORDER = 0.015
-"""Least distance of an object from the picture's border, as a share of its side."""
+"""Minimum distance of an object from the image border, as a share of the image's side."""
 SEEN = 0.4
-"""Every object shows at least this share of itself in at least one frame."""
+"""Minimum visible share of every object in at least one frame."""
 OUTLINE_PX = 64
 DROP_M = 0.0005
 TRIES = 20
@@ -36,7 +36,7 @@ SAME_CLASSES = 5
 
 
 class NoRoom(SimError):
-    """The objects, or a line for the arm beside them, found no place."""
+    """No placement of the objects and of a line for the arm was found."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Spec:
         start, end: of the fingertips' line on the table, metres.
         height_m: of the fingertips above the table.
         yaw_rad: of the gripper about the vertical.
-        aimed: the line was drawn so that it meets an object.
+        aimed: the line was sampled to meet an object.
     """
 
     split: str
@@ -73,21 +73,21 @@ class Spec:
 
 
 def generator(settings: Settings, split: str, index: int, attempt: int | None = None) -> np.random.Generator:
-    """The stream of random numbers of one attempt, or (None) of what all attempts share; splits never share one."""
+    """Random generator of one attempt, or (None) of the choices that all attempts share; unique per split and index."""
     name = int.from_bytes(hashlib.sha256(split.encode()).digest()[:8], "little")
     stream = 0 if attempt is None else attempt + 1
     return np.random.default_rng(np.random.SeedSequence([settings.seed, name, index, stream]))
 
 
 def sample(settings: Settings, split: str, index: int, attempt: int = 0) -> Spec:
-    """Draw one attempt at a trajectory.
+    """Sample one attempt at a trajectory.
 
-    How many objects, of which classes, and whether the line is aimed are the same for all attempts of a trajectory, so
-    that what is drawn again does not shift their shares; places, directions and the line are drawn anew, and after
-    `SAME_CLASSES` attempts the classes too.
+    The number of objects, their classes and whether the line is aimed are the same for all attempts of a trajectory, so
+    that redrawing does not bias their shares; positions, directions and the line are sampled again in every attempt,
+    the classes after `SAME_CLASSES` attempts.
 
     Raises:
-        NoRoom: no arrangement was found that fits into the workspace and the picture.
+        NoRoom: no arrangement was found that fits into the workspace and the image.
     """
     models = object_models(settings.objects, settings.objects_root, settings.image_size)
     shared = generator(settings, split, index)
@@ -107,7 +107,7 @@ def sample(settings: Settings, split: str, index: int, attempt: int = 0) -> Spec
     names = ", ".join(models[number].name for number in classes)
     raise NoRoom(
         f"No arrangement of {names} with a line for the arm was found in workspace_x {settings.workspace_x}, "
-        f"workspace_y {settings.workspace_y} and the camera's picture: make the workspace larger, move the camera "
+        f"workspace_y {settings.workspace_y} and the camera's image: make the workspace larger, move the camera "
         f"back, or lower max_objects {settings.max_objects}."
     )
 
@@ -124,7 +124,7 @@ class _Placed:
 def _place(
     settings: Settings, models: tuple[ObjectModel, ...], classes: list[int], rng: np.random.Generator
 ) -> list[_Placed] | None:
-    """Put the objects into the workspace one by one, whole in the picture and apart from each other."""
+    """Place the objects one by one, entirely inside the image and apart from each other."""
     placed: list[_Placed] = []
     for class_index in classes:
         for _ in range(30):
@@ -138,7 +138,7 @@ def _place(
 
 
 def _some_hidden(settings: Settings, placed: list[_Placed]) -> bool:
-    """Whether an object shows less than `SEEN` of its outline beside those nearer to the camera."""
+    """Whether objects nearer to the camera leave less than `SEEN` of an object's outline visible."""
     nearest_first = sorted(placed, key=lambda each: settings.camera.project(each.points, 1)[1].mean())
     taken = np.zeros((OUTLINE_PX, OUTLINE_PX), dtype=bool)
     for each in nearest_first:
@@ -150,7 +150,7 @@ def _some_hidden(settings: Settings, placed: list[_Placed]) -> bool:
 
 
 def _put(settings: Settings, model: ObjectModel, class_index: int, rng: np.random.Generator) -> _Placed | None:
-    """A random rest, place and direction; None when the picture cuts it off."""
+    """A random rest, position and yaw; None if the image would cut the object off."""
     name, resting = model.rests[int(rng.integers(len(model.rests)))]
     yaw = float(rng.uniform(-np.pi, np.pi))
     (x_low, x_high), (y_low, y_high) = settings.workspace_x, settings.workspace_y
@@ -171,7 +171,7 @@ def _put(settings: Settings, model: ObjectModel, class_index: int, rng: np.rando
 def _line(
     settings: Settings, objects: list[_Placed], aimed: bool, rng: np.random.Generator
 ) -> tuple[tuple[float, float], tuple[float, float], float] | None:
-    """Start, end and gripper yaw of a line whose start is clear of all objects; aimed, it runs over one's middle."""
+    """Start, end and gripper yaw of a line that starts clear of all objects; if aimed, through an object's centre."""
     low = np.array([settings.workspace_x[0], settings.workspace_y[0]]) - LINE_MARGIN_M
     high = np.array([settings.workspace_x[1], settings.workspace_y[1]]) + LINE_MARGIN_M
     for _ in range(40):
@@ -201,10 +201,10 @@ def _in_picture(settings: Settings, points: np.ndarray) -> bool:
 
 
 def _pushed(each: _Placed, start: np.ndarray, end: np.ndarray, hand: np.ndarray) -> np.ndarray:
-    """About where an object's vertices end when the hand, with corners `hand` (4, 2) at `start`, moves to `end`.
+    """Approximate final vertices of an object when the hand, with corners `hand` (4, 2) at `start`, moves to `end`.
 
-    It slides before the hand without turning. Simulating it afterwards finds out whether it really stays in the
-    picture, but lines that would surely push it out are dropped here at no cost.
+    The object is assumed to slide before the hand without turning. The simulation checks later whether it stays inside
+    the image; this cheaply drops lines that would certainly push it out.
     """
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length

@@ -1,4 +1,4 @@
-"""Numbers that describe a P2D folder, all from its label arrays; those that calibrate it beside the published ones."""
+"""Statistics of a P2D folder from its label arrays, and the published values they are calibrated to."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sims.p2d.store import SPLITS, array_path
 from sims.p2d.trajectory import ARM_ID
 
 MOVED_M = 0.02
-"""An object counts as moved when its centre has been this far from where it began."""
+"""An object counts as moved if its centre has been this far from its initial position."""
 
 PUBLISHED = {"visible_per_frame": 2.6, "one_segment_msc": 0.28, "one_segment_msc_fg": 0.06}
 """From the paper's tables: scores of models that put everything into one segment (metrics.md section 0)."""
@@ -26,12 +26,12 @@ class Stats:
     Attributes:
         objects: (N,) objects per scene, without the arm.
         classes: (N, O) class index, -1 unused.
-        visible: (N, T) things with at least one visible pixel, the arm counted.
+        visible: (N, T) number of objects with at least one visible pixel, including the arm.
         area: (N, T, 1 + O) visible share of the image; arm first; NaN where invisible or unused.
-        occlusion: (N, T, 1 + O) hidden share of what would be seen if nothing stood in front; NaN where nothing would.
+        occlusion: (N, T, 1 + O) occluded share of the amodal mask; NaN where the amodal mask is empty.
         cut: (N, T, 1 + O) the visible mask touches the border of the image.
-        step_m: (N, T - 1, O) way of an object's centre from frame to frame; NaN unused.
-        moved_m: (N, O) farthest that an object got from where it began; NaN unused.
+        step_m: (N, T - 1, O) displacement of an object's centre between frames; NaN unused.
+        moved_m: (N, O) largest distance of an object from its initial position; NaN unused.
         arm_contact: (N, T, O), object_contact: (N, T, O, O), as stored.
         aimed: (N,), redraws: (N,), as stored.
     """
@@ -51,17 +51,17 @@ class Stats:
 
     @property
     def visible_per_frame(self) -> float:
-        """Mean number of visible things per frame, the arm counted."""
+        """Mean number of visible objects per frame, including the arm."""
         return float(self.visible.mean())
 
     @property
     def one_segment_msc(self) -> float:
-        """MSC of a model that puts the whole image into one segment: mean over frames of 1 / (visible + 1)."""
+        """MSC of a model that assigns the whole image to one segment: mean over frames of 1 / (visible + 1)."""
         return float((1 / (self.visible + 1)).mean())
 
     @property
     def one_segment_msc_fg(self) -> float:
-        """MSC-FG of that model: mean over frames of the mean area share of what is visible."""
+        """MSC-FG of that model: mean over frames of the mean area share of the visible objects."""
         total = np.nansum(self.area, axis=2)
         return float((total / np.maximum(self.visible, 1)).mean())
 
@@ -82,7 +82,7 @@ class Stats:
 
 
 def statistics(root: Path, manifest: Manifest, splits: Sequence[str] = SPLITS) -> Stats:
-    """Statistics over the given splits together."""
+    """Statistics over the union of the given splits."""
     read = {name: [_load(root, split, name) for split in splits] for name in _NEEDED}
     arrays = {name: np.concatenate(parts) for name, parts in read.items()}
     cut = np.concatenate([_cut(_map(root, split), manifest.settings.max_objects) for split in splits])
@@ -122,7 +122,7 @@ def _map(root: Path, split: str) -> np.ndarray:
 
 
 def _cut(segmentation: np.ndarray, slots: int) -> np.ndarray:
-    """(N, T, 1 + O): which ids stand on the border of (N, T, H, W) segmentations."""
+    """(N, T, 1 + O): which ids touch the image border in (N, T, H, W) segmentations."""
     sides = (segmentation[:, :, 0], segmentation[:, :, -1], segmentation[..., 0], segmentation[..., -1])
     border = np.concatenate(sides, axis=2)
     return np.stack([(border == ARM_ID + part).any(axis=2) for part in range(slots + 1)], axis=2)

@@ -1,15 +1,15 @@
-"""The P2D folder: plain arrays that a memory map reads, one line per finished trajectory, a manifest at the end.
+"""Layout of the P2D folder: memory-mappable arrays, a journal line per finished trajectory, a manifest at the end.
 
 ```
-<root>/manifest.json        written last and at once: a folder without it is not finished
-<root>/trajectories.jsonl   first line: what is made; then one line with a checksum per finished trajectory
+<root>/manifest.json        written last, atomically: a folder without it is unfinished
+<root>/trajectories.jsonl   first line: settings and facts; then one line with a checksum per finished trajectory
 <root>/<split>/<field>.npy  one array per field of `Trajectory`, first axis the trajectory
 ```
 
 Every array has its final size from the start and trajectories are written in place, so several processes can write at
-once. A trajectory counts as made only when its line stands in `trajectories.jsonl`, and whoever goes on with an
-unfinished folder first checks all lines against the arrays: whatever a kill or a power cut left behind, trajectories
-that do not match their checksum are made again. That is why nothing needs to be synced to the disk before the end.
+once. A trajectory counts as finished only when its line is in `trajectories.jsonl`. Resuming first checks all lines
+against the arrays: after a kill or a power cut, trajectories that do not match their checksum are generated again.
+Hence nothing needs to be synced to the disk before the end.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def item_bytes(settings: Settings, name: str) -> int:
 
 
 def header(settings: Settings, split: str, name: str) -> bytes:
-    """The .npy header of an array: written here, not by NumPy, so that its bytes never depend on NumPy's version."""
+    """The .npy header of an array: not written by NumPy, so that its bytes do not depend on NumPy's version."""
     shape = (counts(settings)[split], *item_shape(settings, name))
     text = f"{{'descr': '{FIELDS[name].dtype}', 'fortran_order': False, 'shape': {shape!r}, }}"
     return b"\x93NUMPY\x01\x00\x76\x00" + text.ljust(117).encode("ascii") + b"\n"
@@ -96,11 +96,11 @@ def header(settings: Settings, split: str, name: str) -> bytes:
 HEADER_BYTES = 128
 
 MARGIN_BYTES = 1 << 20
-"""Room for the small files of a folder."""
+"""Space reserved for the small files of a folder."""
 
 
 def array_path(root: Path, split: str, name: str) -> Path:
-    """Where an array lies."""
+    """Path of an array."""
     return root / split / f"{name}.npy"
 
 
@@ -123,10 +123,10 @@ def checksum(parts: Mapping[str, bytes] | Mapping[str, memoryview]) -> str:
 
 
 def to_parts(settings: Settings, trajectory: Trajectory) -> dict[str, memoryview]:
-    """A trajectory's raw bytes per field, as they lie on the disk.
+    """A trajectory's raw bytes per field, as stored on the disk.
 
     Raises:
-        ValueError: an array's type or shape is not what `FIELDS` and the settings say.
+        ValueError: an array's type or shape differs from `FIELDS` and the settings.
     """
     parts = {}
     for name, field in FIELDS.items():
@@ -142,8 +142,8 @@ def to_parts(settings: Settings, trajectory: Trajectory) -> dict[str, memoryview
 class Arrays:
     """The open files of one split, for reading and writing whole trajectories by position.
 
-    Plain positioned reads and writes, not a memory map: a full disk or a failing one is then an `OSError`, not a
-    signal that ends the process.
+    Positioned reads and writes instead of a memory map: a full or failing disk is then an `OSError`, not a signal that
+    ends the process.
     """
 
     def __init__(self, root: Path, split: str, settings: Settings, *, writable: bool = False) -> None:
@@ -159,7 +159,7 @@ class Arrays:
             raise
 
     def write(self, index: int, parts: Mapping[str, memoryview]) -> None:
-        """Writes one trajectory in its place."""
+        """Writes one trajectory at its position."""
         for name, file in self.files.items():
             part, offset = parts[name], HEADER_BYTES + index * self.sizes[name]
             while len(part):
@@ -167,7 +167,7 @@ class Arrays:
                 part, offset = part[written:], offset + written
 
     def checksum(self, index: int) -> str:
-        """Checksum of one trajectory as it is on the disk; raises `OSError` where it cannot be read."""
+        """Checksum of one trajectory on the disk; raises `OSError` if it cannot be read."""
         parts = {
             name: os.pread(file, self.sizes[name], HEADER_BYTES + index * self.sizes[name])
             for name, file in self.files.items()
@@ -175,7 +175,7 @@ class Arrays:
         return checksum(parts)
 
     def sync(self) -> None:
-        """Returns when all that was written is on the disk."""
+        """Syncs all written bytes to the disk."""
         for file in self.files.values():
             os.fsync(file)
 
@@ -187,25 +187,25 @@ class Arrays:
 
 
 def check_room(root: Path, settings: Settings) -> None:
-    """Compares what the arrays still need with what the disk has.
+    """Compares the space that the arrays still need with the free space of the disk.
 
     Raises:
-        SimError: the disk has too little room.
+        SimError: the disk has too little free space.
     """
     room = MARGIN_BYTES + _missing_bytes(root, settings)
     free = shutil.disk_usage(root).free
     if room > free:
         raise SimError(
             f"P2D needs {_size(room)} more at {root} but only {_size(free)} are free there: "
-            "make room or choose another folder"
+            "free some space or choose another folder"
         )
 
 
 def allocate(root: Path, settings: Settings) -> None:
-    """Gives every array its header, its size and its room on the disk; what is in them already stays.
+    """Gives every array its header and final size and reserves its space; existing content stays.
 
     Raises:
-        SimError: the disk has too little room.
+        SimError: the disk has too little free space.
     """
     check_room(root, settings)
     for split in SPLITS:
@@ -224,24 +224,24 @@ def allocate(root: Path, settings: Settings) -> None:
 
 
 def no_room(error: OSError, path: Path | str) -> SimError:
-    """The sentence for a failed write."""
+    """The error for a failed write."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-    remedy = "make room on that disk" if full else "see to that disk"
+    remedy = "free space on that disk" if full else "check that disk"
     return SimError(
-        f"writing {path} failed ({os.strerror(error.errno or 0)}): {remedy} and give the same command again; "
-        "all trajectories made so far stay good"
+        f"writing {path} failed ({os.strerror(error.errno or 0)}): {remedy} and run the same command again; "
+        "all finished trajectories are kept"
     )
 
 
 def _reserve(file: int, size: int) -> None:
-    """Takes the room of a file on the disk at once, so that a full disk is found before the work and not during it."""
+    """Reserves a file's space, so that a full disk is found before the work and not during it."""
     reserve: Callable[[int, int, int], None] | None = getattr(os, "posix_fallocate", None)
     if reserve is None:  # macOS
         return
     try:
         reserve(file, 0, size)
     except OSError as error:
-        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):  # not every file system can
+        if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):  # some file systems cannot reserve
             raise
 
 

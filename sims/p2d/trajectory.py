@@ -1,7 +1,7 @@
-"""What one simulated trajectory holds: the interface between the simulator (makes it) and the store (keeps it).
+"""A simulated trajectory: the interface between the simulator, which generates it, and the store, which writes it.
 
 Legend: T frames, H, W image size, O = `max_objects` object slots (unused ones are padded).
-Segmentation ids: 0 background (table, floor, all that never moves), 1 the arm with all its links, 2 + o object slot o.
+Segmentation ids: 0 background (table, floor, everything static), 1 the arm with all its links, 2 + o object slot o.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ class Trajectory:
         joints: (T, 9) float32, the arm's seven joint angles in radians and two finger positions in metres.
         gripper: (T, 7) float32, pose of the gripper in the world, as `poses`.
         visible_px: (T, O + 1) int32, visible pixels of the arm (index 0) and of each object slot (1 + o).
-        amodal_px: (T, O + 1) int32, pixels each would cover if nothing stood in front of it (image-clipped).
+        amodal_px: (T, O + 1) int32, pixels each would cover without occlusion (within the image).
         arm_contact: (T, O) bool, the arm touched the object at any physics step since the frame before.
         object_contact: (T, O, O) bool, symmetric, likewise between objects.
-        aimed: the line was drawn so that it meets an object.
-        redraws: how many attempts were thrown away before this one (an object left the table, nothing fitted, ...).
+        aimed: the line was sampled to meet an object.
+        redraws: number of attempts rejected before this one (an object left the table, no room, ...).
     """
 
     rgb: np.ndarray

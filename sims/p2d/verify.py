@@ -1,4 +1,4 @@
-"""Is a finished P2D folder what its manifest says? A cheap check for every start, a full one over all bytes."""
+"""Checks of a finished P2D folder against its manifest: a cheap one for every start, a full one over all bytes."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ VERIFIED = ".verified.json"
 
 @dataclass
 class Damage:
-    """What a full check found: sentences about files, trajectories whose bytes are not those that were made."""
+    """Result of a full check: sentences about damaged files, trajectories with a wrong checksum."""
 
     files: list[str] = field(default_factory=list)
     trajectories: list[Key] = field(default_factory=list)
@@ -52,27 +52,27 @@ def check(root: Path, settings: Settings | None = None, splits: Iterable[str] = 
 
     Args:
         root: the folder.
-        settings: those that the data must have been made with; None: any.
-        splits: which splits' files must be good.
+        settings: the settings that the data must have; None: any.
+        splits: the splits whose files are checked.
 
     Raises:
-        SimError: names the first thing that is wrong and the command that helps.
+        SimError: with the first problem and the command that fixes it.
     """
     manifest = read_manifest(root)
     if settings is not None and manifest.fingerprint != fingerprint(settings):
         what = difference(manifest.settings, settings) or "another version of the simulation made them"
-        raise SimError(f"{root} holds other data than wished ({what}): choose another folder or delete this one")
+        raise SimError(f"{root} holds data with other settings ({what}): choose another folder or delete this one")
     found = [line for split in splits for line in _file_damage(root, split, manifest.settings)]
     if found:
         more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-        raise SimError(f"{found[0]}{more}: mend it with python -m sims.p2d verify {root} --repair")
+        raise SimError(f"{found[0]}{more}: repair it with python -m sims.p2d verify {root} --repair")
     return manifest
 
 
 def verify(root: Path, manifest: Manifest, *, shown: bool = True) -> Damage:
     """The full check: every trajectory's bytes against its checksum, on all cores.
 
-    Notes in the folder that nothing was wrong, so that `is_verified` can tell that nothing has changed since.
+    Without damage, it records the state of the files in the folder, so that `is_verified` can detect later changes.
     """
     settings = manifest.settings
     before = _state(root, manifest)
@@ -84,12 +84,12 @@ def verify(root: Path, manifest: Manifest, *, shown: bool = True) -> Damage:
 
 
 def note_verified(root: Path, manifest: Manifest) -> None:
-    """Notes that all bytes have just been found right."""
+    """Records that all bytes have just been verified."""
     _note(root / VERIFIED, _state(root, manifest))
 
 
 def is_verified(root: Path, manifest: Manifest) -> bool:
-    """True if a full check found nothing wrong and no file has been touched since (size, times, inode)."""
+    """True if a full check found no damage and no file has been touched since (size, times, inode)."""
     try:
         noted = json.loads((root / VERIFIED).read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -98,11 +98,11 @@ def is_verified(root: Path, manifest: Manifest) -> bool:
 
 
 def mismatches(root: Path, settings: Settings, records: dict[Key, Record], *, shown: bool) -> list[Key]:
-    """Those of the recorded trajectories whose bytes on the disk do not have the recorded checksum."""
+    """The recorded trajectories whose bytes on the disk do not have the recorded checksum."""
     wanted = [key for key in keys(settings) if key in records]
     bad: list[Key] = []
     volume = sum(item_bytes(settings, name) for name in FIELDS)
-    shown = shown and len(wanted) * volume > 1e9  # below that it takes no time worth showing
+    shown = shown and len(wanted) * volume > 1e9  # a smaller check is too quick for a progress bar
     with (
         ThreadPoolExecutor(os.cpu_count()) as threads,
         progress(f"checking {root.name}", len(wanted), "trajectories", shown=shown) as advance,
@@ -111,7 +111,7 @@ def mismatches(root: Path, settings: Settings, records: dict[Key, Record], *, sh
             part = [key for key in wanted if key[0] == split]
             try:
                 arrays = Arrays(root, split, settings)
-            except OSError:  # a file is missing: all that it held is
+            except OSError:  # a file is missing, and with it all its trajectories
                 bad += part
                 continue
             try:
@@ -155,7 +155,7 @@ def _file_damage(root: Path, split: str, settings: Settings) -> list[str]:
 
 
 def _state(root: Path, manifest: Manifest) -> dict[str, Any]:
-    """What changes when a file is touched. The change time cannot be set back by a user, unlike the modified time."""
+    """State that changes when a file is touched; unlike the modification time, users cannot set the change time."""
     files: dict[str, list[int] | None] = {}
     for path in [root / MANIFEST, *(array_path(root, split, name) for split in SPLITS for name in FIELDS)]:
         try:
@@ -169,12 +169,12 @@ def _state(root: Path, manifest: Manifest) -> dict[str, Any]:
 
 
 def _note(path: Path, state: dict[str, Any]) -> None:
-    with suppress(OSError):  # where nothing can be written, the data are checked again every time
+    with suppress(OSError):  # without write permission, the data are checked again every time
         write_at_once(path, json.dumps(state, indent=1) + "\n")
 
 
 def _runs(found: list[Key]) -> list[str]:
-    """Names of trajectories, neighbours drawn together."""
+    """Names of trajectories, with consecutive ones joined into ranges."""
     names: list[str] = []
     start: Key | None = None
     for (split, index), following in pairwise([*found, ("", -1)]):

@@ -1,7 +1,7 @@
-"""The process that makes trajectories for `pool.Pool`: takes (split, index), simulates, writes, answers.
+"""Worker process of `pool.Pool`: receives (split, index), simulates, writes, answers.
 
-Started as `python -m sims.p2d.worker <file descriptor>`: a fresh interpreter that has imported nothing of its parent,
-so that PyTorch, threads and GPU memory of a training process are not copied along.
+Started as `python -m sims.p2d.worker <file descriptor>`: a fresh interpreter that imports none of its parent's modules,
+so that PyTorch, threads and GPU memory of a training process are not duplicated.
 """
 
 from __future__ import annotations
@@ -14,25 +14,26 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from sims.bullet import INSTALL
 from sims.errors import SimError
 from sims.p2d.settings import Settings
 from sims.p2d.store import Arrays, checksum, to_parts
 
 
 def main(descriptor: int) -> None:
-    """Serves the parent until it closes the connection or is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides what to do
+    """Serves the parent until it closes the connection or ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its workers
     parent = os.getppid()
     connection: Connection = Connection(descriptor)
     try:
         root, settings, simulator = connection.recv()
         serve(connection, Path(root), Settings.model_validate_json(settings), simulator, parent)
     except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the parent has ended or needs this worker no more
+        pass  # the parent has ended or has released this worker
 
 
 def serve(connection: Connection, root: Path, settings: Settings, simulator: str, parent: int) -> None:
-    """Says what the simulator is, then makes one trajectory after the other.
+    """Sends the facts of the simulator, then generates one trajectory after the other.
 
     Messages sent: ("ready", facts), ("done", checksum, redraws), ("differs", checksum), ("failed", sentence),
     ("disk", errno, file).
@@ -58,7 +59,7 @@ def serve(connection: Connection, root: Path, settings: Settings, simulator: str
         parts = to_parts(settings, trajectory)
         found = checksum(parts)
         if os.getppid() != parent:
-            return  # killed: whoever goes on with this folder must find no one else writing
+            return  # the parent was killed: the process that resumes must be the only writer
         if expected not in (None, found):
             connection.send(("differs", found))
             continue
@@ -74,8 +75,8 @@ def serve(connection: Connection, root: Path, settings: Settings, simulator: str
 
 def _not_installed(error: ModuleNotFoundError) -> str:
     return (
-        f"P2D cannot be simulated here because the package {error.name!r} is not installed (pybullet has wheels up to "
-        "Python 3.11 only): make the data with Python 3.11 and copy the folder"
+        f"P2D cannot be simulated here because the package {error.name!r} is not installed: install it (for pybullet, "
+        f"{INSTALL}), or make the data on another machine and copy the folder"
     )
 
 

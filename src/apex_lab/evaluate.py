@@ -42,7 +42,7 @@ class EvaluateConfig(BaseModel):
     save_interval: int = Field(ge=1)
     again: bool
     predictions: str | None = Field(min_length=1)
-    format: Literal["npz", "coco", "davis", "mots"] | None
+    format: Literal["npz", "coco", "weis", "davis", "mots"] | None
     truth: str | None = Field(min_length=1)
     partial: bool
     resize: Literal["masks", "truth"] | None

@@ -183,7 +183,12 @@ class SceneModel(nn.Module):
         """
         raise TypeError(f"{type(self).__name__} has no mixture likelihood, so no posterior over components")
 
-    def from_labels(self, video: Float[Tensor, "B T 3 H W"], segmentation: Integer[Tensor, "B T H W"]) -> Scene:
+    def from_labels(
+        self,
+        video: Float[Tensor, "B T 3 H W"],
+        segmentation: Integer[Tensor, "B T H W"],
+        context: Context | None = None,
+    ) -> Scene:
         """RGB video in [0, 1] and its ground truth -> `Scene`; called in place of `forward` where `needs_labels`."""
         raise TypeError(f"{type(self).__name__} does not read the ground truth: call forward(video, context)")
 

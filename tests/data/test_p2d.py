@@ -146,11 +146,11 @@ def test_folders_that_cannot_be_read_are_refused_in_one_sentence(root: Path, tmp
         P2D(tmp_path / "none", "train")
     make(tmp_path, SETTINGS)
     os.truncate(tmp_path / "train" / "rgb.npy", 1000)
-    with pytest.raises(UserError, match=r"rgb.npy is truncated .*: mend it with python -m sims.p2d verify"):
+    with pytest.raises(UserError, match=r"rgb.npy is truncated .*: repair it with python -m sims.p2d verify"):
         P2D(tmp_path, "train")
     assert len(P2D(tmp_path, "val")) == 2  # the other splits are as good as before
     (tmp_path / MANIFEST).unlink()
-    with pytest.raises(UserError, match=r"is not finished \(10 of 10 trajectories made\): go on with python -m sims"):
+    with pytest.raises(UserError, match=r"is not finished \(10 of 10 trajectories made\): resume with python -m sims"):
         P2D(tmp_path, "val")
 
 

@@ -12,7 +12,7 @@ import pytest
 from filelock import FileLock
 
 from apex_lab.base.interrupts import Interrupted
-from apex_lab.evaluation import EXPORTS
+from apex_lab.evaluation import EXPORTS, export_path
 from apex_lab.inference.predictor import Predictor
 from apex_lab.metrics import KEYS
 from tests.evaluation.conftest import Ask, Make
@@ -239,15 +239,19 @@ def test_exports_score_as_the_model_does(make_run: Make, ask: Ask) -> None:
             assert len(list(made.glob("*.txt"))) == 5
             continue
         read = "coco" if format == "weis" else format
-        words = [] if format == "npz" else [f"truth={run}/predictions/test.npz", f"format={read}"]
-        ended = ask(f"predictions={made}", f"output={format}.json", *words)
-        assert ended.code == 0, ended.err
-        again = json.loads(Path(f"{format}.json").read_text())
-        for name, value in scores(run)["total"].items():
-            assert again["total"][name] == (None if value is None else pytest.approx(value, abs=1e-9)), (format, name)
-        for here, there in zip(scores(run)["per_video"], again["per_video"], strict=True):
-            assert there["hota"] == pytest.approx(here["hota"], abs=1e-9)
-            assert here["video"] == there["video"]
+        truths = [
+            f"truth={path}" for path in (export_path(run, "test", format, truth=True), made.with_name("test.npz"))
+        ]
+        for words in [[]] if format == "npz" else [[truth, f"format={read}"] for truth in truths]:
+            ended = ask(f"predictions={made}", f"output={format}.json", *words)
+            assert ended.code == 0, ended.err
+            again = json.loads(Path(f"{format}.json").read_text())
+            for name, value in scores(run)["total"].items():
+                close = None if value is None else pytest.approx(value, abs=1e-9)
+                assert again["total"][name] == close, (format, name)
+            for here, there in zip(scores(run)["per_video"], again["per_video"], strict=True):
+                assert there["hota"] == pytest.approx(here["hota"], abs=1e-9)
+                assert here["video"] == there["video"]
 
 
 def test_share_of_pixels_given_to_objects(make_run: Make, ask: Ask) -> None:

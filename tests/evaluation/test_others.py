@@ -63,6 +63,25 @@ def test_truth_of_its_own(public: Path, ask: Ask) -> None:
     assert totals[0] == totals[1]
 
 
+def test_an_ignored_label_and_what_looks_like_one(public: Path, ask: Ask) -> None:
+    arrays = dict(np.load(public))
+    truth, masks, ids = (arrays[f"perfect__{part}"] for part in ("gt", "masks", "ids"))
+    truth = truth.copy()
+    truth[:, :12] = 255
+    np.savez("void.npz", perfect__gt=truth, perfect__masks=masks, perfect__ids=ids)
+    ended = ask("predictions=void.npz")
+    assert ended.code == 0
+    told = "void.npz: label 255 was scored as an object in 1 videos, first in 'perfect'; where it marks unlabelled"
+    assert told in ended.err
+    assert "set scoring.ignore_label=255" in ended.err
+    assert json.loads(Path("void.metrics.json").read_text())["total"]["msc_fg"] < 1
+    ended = ask("predictions=void.npz", "scoring.ignore_label=255")
+    assert (ended.code, ended.err) == (0, "")
+    result = json.loads(Path("void.metrics.json").read_text())
+    assert result["settings"]["ignore_label"] == 255
+    assert [result["total"][name] for name in ("ari", "msc_fg", "mota", "hota", "jf")] == [1, 1, 100, 1, 1]
+
+
 def test_malformed_predictions_are_refused_by_name(public: Path, ask: Ask) -> None:
     masks, ids, gt = (np.load(public)[f"perfect__{part}"] for part in ("masks", "ids", "gt"))
     nan = masks.astype(np.float32)

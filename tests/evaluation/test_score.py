@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import pickle
+import re
 import weakref
 from pathlib import Path
 
@@ -156,6 +157,19 @@ def test_the_file_s_scoring_is_that_of_training() -> None:
     assert ScoringPart.model_validate(stored) == ScoringPart()
     assert ScoringPart().settings(tracks=True) == EvaluatorSettings()
     assert ScoringPart().settings(tracks=False) == EvaluatorSettings(identities="none")
+
+
+def test_sections_that_docstrings_cite_are_on_the_page() -> None:
+    headings = set(re.findall(r"^##+ (\d(?:\.\d)?)[. ]", page(), flags=re.MULTILINE))
+    assert headings >= {"0", "1", "1.1", "1.2", "1.3", "2", "2.1", "2.2", "2.3", "2.4", "3", "4", "5", "6", "7"}
+    cited = 0
+    for folder in ("src", "sims"):
+        for file in (REPOSITORY / folder).rglob("*.py"):
+            for numbers in re.findall(r"metrics\.md\s+sections? ([\d., and]+)", file.read_text()):
+                for number in re.findall(r"\d(?:\.\d)?", numbers.split(", step")[0]):
+                    assert number in headings, (file, number)
+                    cited += 1
+    assert cited > 15
 
 
 def test_the_page_of_keys_is_current() -> None:

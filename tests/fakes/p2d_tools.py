@@ -19,9 +19,9 @@ import sys
 from pathlib import Path
 from sims.p2d import __main__ as command, generate as module
 module.SIMULATOR = "{FAKE}"
-make, mend = module.generate, module.repair
+make, repair = module.generate, module.repair
 command.generate = lambda *a, **k: make(*a, simulator="{FAKE}", **k)
-command.repair = lambda *a, **k: mend(*a, simulator="{FAKE}", **k)
+command.repair = lambda *a, **k: repair(*a, simulator="{FAKE}", **k)
 sys.exit(command.main(sys.argv[1:]))
 """
 """`python -m sims.p2d` with the fake simulator."""

@@ -12,9 +12,11 @@ from pycocotools import mask as pycoco
 
 from apex_lab.base.errors import UserError
 from apex_lab.formats import EXPORTS, PredictedVideo, open_truth, open_writer, score_predictions
-from apex_lab.formats.coco import decode, encode, read_coco
 from apex_lab.formats.davis import palette, read_davis
-from apex_lab.formats.mot import read_mots
+from apex_lab.formats.mots import read_mots
+from apex_lab.formats.rle import decode, encode
+from apex_lab.formats.truth import load_json
+from apex_lab.formats.weis import read_weis
 from apex_lab.metrics.bench_scoring import synthetic_video
 
 
@@ -47,7 +49,8 @@ def test_every_format_gives_the_same_numbers(tmp_path: Path, npz: Path, format: 
     found, expected = score_predictions(path, truth=npz), score_predictions(npz)
     assert found["total"] == pytest.approx(expected["total"], abs=1e-12)
     assert [row["video"] for row in found["per_video"]] == ["v0", "v1", "v2"]
-    assert found["source"]["format"] == ("coco" if format == "weis" else format)
+    assert found["source"]["format"] == format
+    assert score_predictions(path, truth=npz, format="coco" if format == "weis" else format)["total"] == found["total"]
 
 
 def test_davis_pictures_as_ground_truth(tmp_path: Path, npz: Path) -> None:
@@ -156,7 +159,7 @@ def test_palette_pictures(tmp_path: Path) -> None:
         assert image.getpalette()[:12] == [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0]
     assert palette()[255].tolist() == [224, 224, 192]
     assert read_davis(tmp_path, "a").tolist() == [[[2, 1, 0]]]
-    with pytest.raises(UserError, match="has 256 identities, a palette image tells 255 apart"), writer:
+    with pytest.raises(UserError, match="has 256 identities, a palette image tells 254 apart"), writer:
         writer.add(PredictedVideo("b", np.arange(256).reshape(1, 16, 16)))
     with pytest.raises(UserError, match="'a/b' cannot be a file name"), writer:
         writer.add(PredictedVideo("a/b", prediction))
@@ -183,14 +186,17 @@ def test_an_export_of_nothing(tmp_path: Path) -> None:
     with open_writer("coco", tmp_path / "p.json"):
         pass
     assert json.loads((tmp_path / "p.json").read_text()) == []
+    with open_writer("weis", tmp_path / "p.json"):
+        pass
+    assert json.loads((tmp_path / "p.json").read_text()) == []
     with pytest.raises(UserError, match="no export format 'gif'"):
         open_writer("gif", tmp_path)
     assert "mot" in EXPORTS
 
 
 RLE = encode(np.ones((1, 2, 2), dtype=bool))[0]
-BAD_COCO: dict[str, tuple[Any, str]] = {
-    "no list": ({"videos": []}, "must hold a list of videos"),
+BAD_WEIS: dict[str, tuple[Any, str]] = {
+    "no list": ([{"videos": []}], "must hold a list of videos"),
     "videos": ([], "holds 0 videos, the ground truth 1"),
     "frames": ([[]], "video 0: has 0 frames, the ground truth 1"),
     "keys": ([[{"ids": [1]}]], "video 0, frame 0: want"),
@@ -198,7 +204,7 @@ BAD_COCO: dict[str, tuple[Any, str]] = {
     "id": ([[{"ids": [-1], "masks": [RLE]}]], "the id -1 is no integer >= 0"),
     "kind of id": ([[{"ids": ["a"], "masks": [RLE]}]], "the id 'a' is no integer"),
     "twice": ([[{"ids": [3, 3], "masks": [RLE, RLE]}]], "has the id 3 more than once"),
-    "overlap": ([[{"ids": [3, 4], "masks": [RLE, RLE]}]], "the mask of id 4 covers pixels of another"),
+    "overlap": ([[{"ids": [3, 4], "masks": [RLE, RLE]}]], "frame 0, id 4: the mask covers pixels of another"),
     "size": ([[{"ids": [3], "masks": [{**RLE, "size": [4, 1]}]}]], "a mask is 4 x 1, the ground truth 2 x 2"),
     "runs": ([[{"ids": [3], "masks": [{**RLE, "counts": "01"}]}]], "do not fill its 2 x 2 pixels"),
     "empty": ([[{"ids": [3], "masks": [{**RLE, "counts": ""}]}]], "do not fill"),
@@ -211,19 +217,19 @@ BAD_COCO: dict[str, tuple[Any, str]] = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_COCO)
+@pytest.mark.parametrize("case", BAD_WEIS)
 def test_malformed_json(tmp_path: Path, case: str) -> None:
-    content, message = BAD_COCO[case]
+    content, message = BAD_WEIS[case]
     path = tmp_path / "p.json"
     path.write_text(json.dumps(content))
     with pytest.raises(UserError, match=message):
-        list(read_coco(path, [(1, 2, 2)]))
+        list(read_weis(load_json(path), path, [(1, 2, 2)]))
 
 
 def test_files_that_are_no_json(tmp_path: Path, npz: Path) -> None:
     path = tmp_path / "p.json"
     with pytest.raises(UserError, match="there is no file"):
-        list(read_coco(path, []))
+        load_json(path)
     path.write_text("[[")
     with pytest.raises(UserError, match="no readable JSON"):
         score_predictions(path, truth=npz)
@@ -235,7 +241,7 @@ def test_files_that_are_no_json(tmp_path: Path, npz: Path) -> None:
 
 
 BAD_MOTS = {
-    "0 1 1 2 2 04": "frame 0 is none of the 1",
+    "0 1 1 2 2 04": "frame 0 is none: MOTS counts frames from 1",
     "1 0 1 2 2 04": "with an id from 1",
     "1 1 1 2": "want 'frame id class height width mask'",
     "1 1 1 2 3 04": "a mask is 2 x 3, the ground truth 2 x 2",

@@ -1,14 +1,7 @@
-"""Agreement with TrackEval, which lives in an environment of its own (its requirements do not go with ours).
-
-`python -m venv ENV && ENV/bin/pip install trackeval scikit-image`, then
-`APEX_LAB_TRACKEVAL_PYTHON=ENV/bin/python pytest tests/metrics/test_trackeval.py`.
-"""
+"""Agreement with TrackEval (tests/trackeval_python.py says how to install it)."""
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +12,9 @@ from apex_lab.metrics import Evaluator
 from apex_lab.metrics.hota import HotaCounts
 from apex_lab.metrics.identity import IdentityCounts
 from apex_lab.metrics.tracking import TrackingSettings, detections
+from tests.trackeval_python import ask_trackeval, needs_trackeval
 
-PYTHON = os.environ.get("APEX_LAB_TRACKEVAL_PYTHON")
-pytestmark = pytest.mark.skipif(PYTHON is None, reason="APEX_LAB_TRACKEVAL_PYTHON names no interpreter with TrackEval")
+pytestmark = needs_trackeval
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +32,7 @@ def theirs(make, videos) -> dict[str, Any]:
         frames = detections(make.counts_of(prediction, truth), TrackingSettings())
         rows = [{"rows": f.rows.tolist(), "columns": f.columns.tolist(), "iou": f.iou.tolist()} for f in frames]
         question.append({"frames": rows, "truth": truth.tolist(), "prediction": prediction.tolist()})
-    script = Path(__file__).with_name("trackeval_reference.py")
-    answer = subprocess.run(
-        [str(PYTHON), str(script)], input=json.dumps(question), capture_output=True, text=True, check=True
-    )
-    return json.loads(answer.stdout.splitlines()[-1])
+    return ask_trackeval(Path(__file__).with_name("trackeval_reference.py"), question)
 
 
 def test_hota(make, videos, theirs: dict[str, Any]) -> None:

@@ -1,4 +1,4 @@
-"""The objects' models: sizes, rests, textures, and folders that people bring along."""
+"""The objects' models: sizes, resting orientations, textures, and folders of textured models."""
 
 from __future__ import annotations
 
@@ -87,10 +87,10 @@ def test_textured_models_are_read_from_a_folder(tmp_path: Path, material: bool) 
 
 
 def test_missing_things_are_named(tmp_path: Path) -> None:
-    with pytest.raises(SimError, match="is no folder"):
+    with pytest.raises(SimError, match="is not a folder"):
         object_models(("banana",), str(tmp_path / "nowhere"))
     _textured_box(tmp_path / "YcbBanana", (0.1, 0.03, 0.03))
-    with pytest.raises(SimError, match=r"no sub-folder for object 'mug' \(there is YcbBanana\)"):
+    with pytest.raises(SimError, match=r"no sub-folder for object 'mug' \(it has YcbBanana\)"):
         object_models(("banana", "mug"), str(tmp_path))
     (tmp_path / "YcbMug").mkdir()
     with pytest.raises(SimError, match="no OBJ file with texture coordinates"):
@@ -101,7 +101,7 @@ def test_missing_things_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["011_banana", "YcbBanana", "banana", "Banana"])
-def test_names_are_found_with_and_without_ornaments(name: str) -> None:
+def test_names_are_found_with_and_without_prefixes(name: str) -> None:
     assert official.plain_name(name) == "banana"
 
 

@@ -1,4 +1,4 @@
-"""The empty scene: exact depth, a table that is not flat in colour."""
+"""The empty scene: exact depth, a table with texture."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""What is made once: whole or not at all, by one of many processes."""
+"""The cache of derived files: made once and atomically, by one of many processes."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import multiprocessing
 import sys
 import time
@@ -80,9 +81,31 @@ def test_another_recipe_is_another_folder() -> None:
     assert cache.made_once("thing", {"a": 1}, _slow_make) != cache.made_once("thing", {"a": 2}, _slow_make)
 
 
-def test_without_pybullet_one_sentence_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_pybullet_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(SimError, match=r"use Python 3\.11"):
+    with pytest.raises(SimError, match=r"PyBullet is not installed: run `pip install pybullet`"):
         bullet.load_pybullet()
-    with pytest.raises(SimError, match=r"use Python 3\.11"):
+    with pytest.raises(SimError, match="PyBullet is not installed"):
         cache.versions()
+
+
+@pytest.mark.parametrize(
+    ("provided_by", "recorded"),
+    [
+        (["pybullet"], "3.2.7"),
+        (["pybullet-arm64"], "3.2.8 (pybullet-arm64)"),
+        (["pybullet-arm64", "pybullet"], "3.2.7 + 3.2.8 (pybullet-arm64)"),
+        ([], "without metadata"),
+    ],
+)
+def test_any_distribution_of_pybullet_is_recorded(
+    provided_by: list[str], recorded: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    versions = {"pybullet": "3.2.7", "pybullet-arm64": "3.2.8"}
+    monkeypatch.setattr(importlib.metadata, "packages_distributions", lambda: {"pybullet": provided_by})
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: versions.get(name, "1.0"))
+    bullet.pybullet_version.cache_clear()
+    try:
+        assert cache.versions()["pybullet"] == recorded
+    finally:
+        bullet.pybullet_version.cache_clear()

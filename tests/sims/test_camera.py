@@ -1,4 +1,4 @@
-"""The camera's own matrices against each other and against points whose place is known."""
+"""The camera's own matrices against each other and against points at known positions."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_extrinsics_are_a_rigid_motion() -> None:
     ("change", "words"),
     [
         ({"near_m": 2.0, "far_m": 1.0}, "far_m 1.0 must be greater"),
-        ({"eye": (0.5, 0.0, 1.0), "target": (0.5, 0.0, 0.0)}, "straight above"),
+        ({"eye": (0.5, 0.0, 1.0), "target": (0.5, 0.0, 0.0)}, "vertically above"),
         ({"fov_deg": 0.5}, "fov_deg"),
         ({"zoom": 2.0}, "zoom"),
     ],

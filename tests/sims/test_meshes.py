@@ -1,4 +1,4 @@
-"""Frames, few-faced copies, hulls and files."""
+"""Object frames, decimation, hulls and files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Labels against the picture they belong to and against geometry that is drawn here in other ways."""
+"""Labels against their image and against geometry rendered independently."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from sims.world import World
 SIZE = 96
 NAMES = ("master_chef_can", "banana", "cracker_box")
 FAR_AWAY = np.array([0.0, -1.2, 0.0, -2.0, 0.0, 1.0, 0.8, 0.0, 0.0])
-"""Joints that fold the arm out of the picture."""
+"""Joints that fold the arm out of the image."""
 
 
 def _standing(model: ObjectModel, x: float, y: float, yaw: float) -> np.ndarray:
@@ -58,7 +58,7 @@ def models() -> tuple[ObjectModel, ...]:
 
 @pytest.fixture(scope="module")
 def poses(models: tuple[ObjectModel, ...]) -> np.ndarray:
-    """A can half behind the arm, a banana partly before the can, a box aside."""
+    """A can half occluded by the arm, a banana partly in front of the can, a box aside."""
     places = ((0.52, 0.02, 0.3), (0.6, -0.08, 1.0), (0.42, 0.12, -0.4))
     return np.array([_standing(model, *place) for model, place in zip(models, places, strict=True)])
 
@@ -110,13 +110,13 @@ def test_amodal_counts_are_what_each_body_covers_alone(
 
 
 def test_silhouettes_agree_with_projected_meshes(renderer: Renderer, poses: np.ndarray) -> None:
-    """The stored pose and the scan, projected and filled by another program, overlap the mask by more than 0.95."""
+    """The stored pose and the scan, projected and filled by OpenCV, overlap the mask by more than 0.95."""
     models = object_models(NAMES)
     for model, pose in zip(models, poses, strict=True):
         renderer.show((model,))
         mask = renderer.picture(FAR_AWAY, pose[None]).segmentation == FIRST_OBJECT_ID
         mesh = trimesh.load_mesh(model.visual)
-        # Filled eight times as fine and read in the middle of each pixel: OpenCV fills every pixel that it touches.
+        # Filled at eight times the resolution and read at pixel centres: OpenCV fills every pixel that it touches.
         pixels, _ = renderer.camera.project(moved(np.asarray(mesh.vertices), pose), 8 * SIZE)
         fine = np.zeros((8 * SIZE, 8 * SIZE), dtype=np.uint8)
         for triangle in np.rint((pixels[mesh.faces] - 0.5) * 16).astype(np.int32):
@@ -157,7 +157,7 @@ def test_depth_of_a_box_of_known_size(renderer: Renderer, tmp_path: Path) -> Non
 
 
 def test_tiny_renderer_and_ray_caster_agree_on_the_table() -> None:
-    """The table's top drawn by PyBullet lies at the depth that the background says."""
+    """The table top rendered by PyBullet has the depth of the ray-cast background."""
     camera = Camera()
     stage = Stage("tiny", None)
     bullet = stage.bullet
@@ -203,7 +203,7 @@ def test_cover_contains_the_silhouette(renderer: Renderer, poses: np.ndarray) ->
         assert picture.depth[mine].max() <= far + 1e-4
 
 
-def test_no_two_objects_look_alike_in_the_picture() -> None:
+def test_no_two_objects_look_alike_in_the_image() -> None:
     renderer = Renderer(Camera(), 64)
     colours = {}
     for model in object_models(tuple(entry.name for entry in CATALOGUE), None, 64):
@@ -250,8 +250,8 @@ def test_a_missing_egl_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
         Stage("egl", None)
 
 
-def test_the_few_faced_arm_looks_like_the_arm(joints: np.ndarray) -> None:
-    """Against PyBullet's own meshes at P2D's size: the same silhouette, the same colours but for a few pixels."""
+def test_the_decimated_arm_looks_like_the_arm(joints: np.ndarray) -> None:
+    """Against PyBullet's meshes at P2D's size: the same silhouette, the same colours except in a few pixels."""
     model = panda.arm_model()
     pictures = []
     for urdf in (model.visual, model.original):

@@ -1,4 +1,4 @@
-"""Surfaces from grids and baked pictures, against shapes whose size is known."""
+"""Level sets and baked textures, against shapes of known size."""
 
 from __future__ import annotations
 

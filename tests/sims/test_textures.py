@@ -1,4 +1,4 @@
-"""Drawn pictures and the coordinates that lay them over the scans."""
+"""Procedural textures and their coordinates on the scans."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_no_texture_is_flat(name: str, pictures: dict[str, np.ndarray]) -> None:
 
 
 def test_no_two_textures_are_alike(pictures: dict[str, np.ndarray]) -> None:
-    """By colours alone, wherever they stand: the distance between histograms is large for every pair."""
+    """By colours alone, regardless of position: the distance between histograms is large for every pair."""
     histograms = {}
     for name, picture in pictures.items():
         counts, _ = np.histogramdd(picture.reshape(-1, 3), bins=(6, 6, 6), range=[(0, 256)] * 3)

@@ -89,7 +89,7 @@ def test_points_out_of_reach_are_noticed(world: World) -> None:
     assert error > 0.1
 
 
-def test_motors_hold_the_arm_and_contacts_are_told(world: World) -> None:
+def test_motors_hold_the_arm_and_contacts_are_reported(world: World) -> None:
     world.rebuild()
     _put(world, "sugar_box", 0.5, 0.0)
     _put(world, "cracker_box", 0.5, 0.3)

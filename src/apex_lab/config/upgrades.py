@@ -47,6 +47,10 @@ TARGETS = {
     "apex_lab.optimizers.Muon": "apex_lab.training.optimizers.Muon",
     "apex_lab.callbacks.Progress": "apex_lab.training.callbacks.Progress",
     "apex_lab.loggers.Wandb": "apex_lab.training.loggers.Wandb",
+    "apex_lab.models.background_subtraction.BackgroundSubtraction": "apex_lab.models.yardsticks.BackgroundSubtraction",
+    "apex_lab.models.color_clusters.ColorClusters": "apex_lab.models.yardsticks.ColorClusters",
+    "apex_lab.models.one_segment.OneSegment": "apex_lab.models.yardsticks.OneSegment",
+    "apex_lab.models.oracle.Oracle": "apex_lab.models.yardsticks.Oracle",
     **{
         f"apex_lab.schedules.{name}": f"apex_lab.training.schedules.{name}"
         for name in ("Constant", "Linear", "Cosine", "Exponential", "Piecewise")

@@ -7,6 +7,7 @@ from apex_lab.data.loading import training_loader, whole_loader
 from apex_lab.data.p2d import P2D
 from apex_lab.data.p2d_source import P2DSource
 from apex_lab.data.source import VideoSource
+from apex_lab.data.sprites import Sprites, SpritesSource
 from apex_lab.data.video_set import Clip, Item, VideoSet
 
 __all__ = [
@@ -15,6 +16,8 @@ __all__ = [
     "ClipSampler",
     "Item",
     "P2DSource",
+    "Sprites",
+    "SpritesSource",
     "VideoSet",
     "VideoSource",
     "training_loader",

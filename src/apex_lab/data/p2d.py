@@ -25,13 +25,9 @@ from apex_lab.base.errors import UserError
 from apex_lab.data.video_set import MEDIAN_SAMPLE, Clip, VideoSet
 from apex_lab.metrics.objects import ObjectMetadata, p2d_metadata
 from sims.errors import SimError
+from sims.p2d.export import video_name as p2d_video_name
 from sims.p2d.store import FIELDS, SPLITS, array_path
 from sims.p2d.verify import check
-
-
-def p2d_video_name(split: str, index: int) -> str:
-    """What a P2D video is called in files of predictions and results."""
-    return f"{split}_{index:05d}"
 
 
 class P2D(VideoSet):

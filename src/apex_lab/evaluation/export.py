@@ -21,7 +21,14 @@ def export_path(folder: Path, split: str, format: str, truth: bool = False) -> P
     return folder / "predictions" / name
 
 
-def write(folder: Path, split: str, format: str, predictions: Iterable[Predicted], videos: VideoSet) -> list[Path]:
+def write(
+    folder: Path,
+    split: str,
+    format: str,
+    predictions: Iterable[Predicted],
+    videos: VideoSet,
+    ignore_label: int | None = None,
+) -> list[Path]:
     """Writes predictions and, in formats that keep it apart, the ground truth.
 
     The npz file has one-hot masks: each pixel belongs to the component that won it, so a score of the file is the
@@ -33,6 +40,7 @@ def write(folder: Path, split: str, format: str, predictions: Iterable[Predicted
         format: one of `EXPORTS`.
         predictions: of all videos, read as often as needed.
         videos: where the ground truth is; an unlabelled set has none, and only predictions are written.
+        ignore_label: label of the ground truth that is left out of every score; marked as each format does.
 
     Returns:
         The paths, predictions first.
@@ -42,9 +50,12 @@ def write(folder: Path, split: str, format: str, predictions: Iterable[Predicted
         path = export_path(folder, split, format, truth)
         for draft in path.parent.glob(f".{path.name}.*"):
             draft.unlink()  # left by a kill in the middle of writing
-        with open_writer(format, path, truth) as writer:
+        with open_writer(format, path, truth, ignore_label) as writer:
             for each in predictions:
                 labels = videos[each.position]["segmentation"].numpy() if videos.labelled else None
-                writer.add(PredictedVideo(each.name, each.identities, labels, background_ids=each.backgrounds))
+                about = videos.metadata(each.position)
+                writer.add(
+                    PredictedVideo(each.name, each.identities, labels, background_ids=each.backgrounds, objects=about)
+                )
         paths.append(path)
     return paths

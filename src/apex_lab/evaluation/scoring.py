@@ -39,7 +39,8 @@ class ScoringPart(_Part):
     """How videos are scored.
 
     Attributes:
-        tracking, public_first_frame, skip_empty, boundary_tolerance: as in `apex_lab.metrics.EvaluatorSettings`.
+        tracking, public_first_frame, skip_empty, boundary_tolerance, ignore_label: as in
+            `apex_lab.metrics.EvaluatorSettings`.
         identities: `own`, `none` and `linked` as there; `auto` is `own` for a model that tracks (`SceneModel.tracks`)
             and for files of predictions, else `none`.
         min_presence, presence_after: as in `apex_lab.metrics.scene_identities`.
@@ -50,6 +51,7 @@ class ScoringPart(_Part):
     public_first_frame: int | None = 2
     skip_empty: bool = False
     boundary_tolerance: float = TOLERANCE
+    ignore_label: int | None = None
     identities: Literal["auto", "own", "none", "linked"] = "auto"
     min_presence: float = Field(default=0.5, ge=0, le=1)
     presence_after: bool = False
@@ -72,6 +74,7 @@ class ScoringPart(_Part):
             public_first_frame=self.public_first_frame,
             skip_empty=self.skip_empty,
             boundary_tolerance=self.boundary_tolerance,
+            ignore_label=self.ignore_label,
             identities=("own" if tracks else "none") if self.identities == "auto" else self.identities,
             per_frame=details,
             events=details,

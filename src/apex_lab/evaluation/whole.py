@@ -74,7 +74,7 @@ def evaluate(
     written = []
     if asked.export is not None:
         assert parts is not None
-        written = exports.write(asked.folder, asked.split, asked.export, parts, videos)
+        written = exports.write(asked.folder, asked.split, asked.export, parts, videos, asked.scoring.ignore_label)
     about = {**asked.about, "settings": {**asked.settings, "scoring": asked.scoring.stored(predictor.model.tracks)}}
     scored = record.store(asked.folder, asked.split, tally, result, about, chosen, asked.beside)
     if parts is not None:

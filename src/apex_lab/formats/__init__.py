@@ -3,11 +3,13 @@
 | format | what | written by | read |
 | --- | --- | --- | --- |
 | `npz` | soft masks and ids, `V__gt`, `V__masks`, `V__ids` per video V | `NpzWriter` | yes |
-| `coco` | COCO run-length masks in JSON, layout of Weis et al. | `CocoWriter` | yes |
-| `weis` | the same with the run strings that the public program reads | `CocoWriter(runs=True)` | as `coco` |
+| `coco` | JSON that `pycocotools` reads: a result list, ground truth with images | `CocoWriter` | yes |
+| `weis` | JSON that the public program of Weis et al. reads | `WeisWriter` | yes |
 | `davis` | palette PNGs | `DavisWriter` | yes |
 | `mots` | MOTS text, masks | `MotWriter(masks=True)` | yes |
 | `mot` | MOTChallenge text, boxes | `MotWriter` | no, boxes hold no masks |
+
+Ground truth can be written in all of them (npz files hold it anyway) and read back from all but `mot`.
 
 `score_predictions` scores what can be read; the result's keys are described in `apex_lab.metrics.KEYS` and in the
 result itself: `settings`, `versions`, `total` (the data set), `per_video`, `per_frame`, `per_object`, `hota_alpha`
@@ -26,30 +28,37 @@ from apex_lab.formats.npz import NpzWriter
 from apex_lab.formats.scored_files import score_predictions, write_result
 from apex_lab.formats.truth import open_truth, p2d_video_name
 from apex_lab.formats.video import PredictedVideo
+from apex_lab.formats.weis import WeisWriter
 
 EXPORTS = ("npz", "coco", "weis", "davis", "mots", "mot")
 """Formats that `open_writer` writes."""
 
 
-def open_writer(format: str, path: str | Path, truth: bool = False) -> NpzWriter | CocoWriter | DavisWriter | MotWriter:
+Writer = NpzWriter | CocoWriter | WeisWriter | DavisWriter | MotWriter
+
+
+def open_writer(format: str, path: str | Path, truth: bool = False, ignore_label: int | None = None) -> Writer:
     """A writer of one format, to be used with `with` and fed with `add(PredictedVideo)`.
 
     Args:
         format: one of `EXPORTS`.
         path: the file, or for davis, mots and mot the folder.
         truth: write the ground truth in place of the predictions (npz files hold both anyway).
+        ignore_label: the true label that is to be ignored, which is marked as the format does it.
 
     Raises:
         UserError: no such format.
     """
     if format == "npz":
         return NpzWriter(path)
-    if format in ("coco", "weis"):
-        return CocoWriter(path, runs=format == "weis", truth=truth)
+    if format == "coco":
+        return CocoWriter(path, truth, ignore_label)
+    if format == "weis":
+        return WeisWriter(path, truth, ignore_label)
     if format == "davis":
-        return DavisWriter(path, truth=truth)
+        return DavisWriter(path, truth, ignore_label)
     if format in ("mots", "mot"):
-        return MotWriter(path, masks=format == "mots", truth=truth)
+        return MotWriter(path, format == "mots", truth, ignore_label)
     raise UserError(f"there is no export format {format!r}; choose one of {', '.join(EXPORTS)}")
 
 
@@ -60,6 +69,8 @@ __all__ = [
     "MotWriter",
     "NpzWriter",
     "PredictedVideo",
+    "WeisWriter",
+    "Writer",
     "open_truth",
     "open_writer",
     "p2d_video_name",

@@ -1,74 +1,80 @@
-"""Predictions as run-length masks in JSON, in the layout of the evaluation of Weis et al. (JMLR 2021).
+"""Predictions and ground truth as COCO has them: what `pycocotools` reads with `COCO(file)` and `loadRes(file)`.
 
-The file is a list of videos, each a list of frames, each `{"masks": [...], "ids": [...]}` with one mask per identity;
-identities are unique over the whole file, and videos have no names: their order counts. In a file of ground truth
-every frame has `num_bg` besides, the number of background masks, which are the last ones.
+Ground truth: an object with `images`, `annotations` (run-length masks, boxes, areas), `categories` and `videos`. Images
+are the frames of all videos in order, their ids counted from 0; `video_id` and `frame_id` say where one belongs, and
+`track_id` is the true label. Pixels to be ignored are annotations with `iscrowd` 1. This is also the layout of
+`python -m sims.p2d export --format coco`, whose ids are the same where all videos of a split were evaluated.
 
-Masks are COCO's run-length encoding, `{"size": [height, width], "counts": "..."}`. With `runs=True` they are the
-strings that the public program itself reads, "start length start length ..." over the rows of the image, counted from
-1; these do not know the size of the image, so a reader has to be told.
-
-Pixels of no mask form one more segment over the whole video; see `video.with_rest`.
+Predictions: a result list, one entry per mask with `image_id`, `category_id` (there is one category, "object"),
+`segmentation`, `score` (1) and `track_id`, the identity over time. The background is left out where it is known;
+`score.py` makes one segment of all pixels without a mask.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int64, Integer
-from pycocotools import mask as coco
+from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
-from apex_lab.formats.video import PredictedVideo, with_rest
+from apex_lab.formats.rle import UNPAINTED, encode, paint
+from apex_lab.formats.video import PredictedVideo, labels_of, with_rest
+from apex_lab.metrics.contingency import BACKGROUND
 from apex_lab.scene import ABSENT
 
-SMALL_MASK = 5
-"""The public program drops masks of so many pixels and then takes the last one left for the background."""
+CATEGORY = {"id": 1, "name": "object", "supercategory": "object"}
+"""Classes are not predicted here, and COCO compares masks of one category alone."""
+
+Places = Mapping[int, tuple[str, int]]
+"""Image id -> name of the video and place of the frame in it, from 0."""
 
 
 class CocoWriter:
-    """Writes videos one at a time; the file appears under its name when all is written (`with` it).
+    """Collects videos one at a time; the file appears under its name when all are there (`with` it).
 
     Args:
         path: the file.
-        runs: masks as the strings of the public program.
-        truth: write `PredictedVideo.truth` in place of the prediction, with `num_bg`.
+        truth: write `PredictedVideo.truth` with images and annotations in place of a result list.
+        ignore_label: pixels of this true label become annotations with `iscrowd` 1.
     """
 
-    def __init__(self, path: str | Path, runs: bool = False, truth: bool = False) -> None:
-        self.path, self.runs, self.truth = Path(path), runs, truth
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._draft = self.path.with_name(f".{self.path.name}.{os.getpid()}")
-        self._file = open(self._draft, "w", encoding="utf-8")  # noqa: SIM115 (closed in __exit__)
-        self._separator, self._offset = "[", 0
+    def __init__(self, path: str | Path, truth: bool = False, ignore_label: int | None = None) -> None:
+        self.path, self.truth, self.ignore_label = Path(path), truth, ignore_label
+        self._videos: list[dict[str, Any]] = []
+        self._images: list[dict[str, Any]] = []
+        self._masks: list[dict[str, Any]] = []
 
     def add(self, video: PredictedVideo) -> None:
-        """Writes one video; its identities are shifted so that no other video of the file has them."""
-        labels = video.truth if self.truth else video.identities
-        if labels is None:
-            raise ValueError(f"video {video.name!r} has no ground truth to write")
-        frames = [self._frame(frame) for frame in labels]
-        self._offset += int(labels.max()) + 1
-        self._file.write(self._separator + json.dumps(frames))
-        self._separator = ",\n"
+        """Adds one video."""
+        labels = labels_of(video, self.truth)
+        frames, height, width = labels.shape
+        number, size = len(self._videos), {"width": width, "height": height}
+        self._videos.append({"id": number, "name": video.name, **size, "length": frames})
+        left_out = {BACKGROUND} if self.truth else set(video.background_ids)
+        for t, frame in enumerate(labels):
+            image = {"id": len(self._images), "file_name": f"{video.name}/{t:05d}.png", **size}
+            self._images.append({**image, "video_id": number, "frame_id": t})
+            place = {"image_id": image["id"], "video_id": number, "frame_id": t}
+            names = [name for name in np.unique(frame).tolist() if name not in left_out]
+            for name in names:
+                self._masks.append({**place, **self._mask(frame, name)})
 
-    def _frame(self, labels: Integer[np.ndarray, "H W"]) -> dict[str, Any]:
-        names, areas = np.unique(labels, return_counts=True)
-        extra = {}
-        if self.truth:
-            # Last in the list, and left out where the public program would drop it and remove an object in its place.
-            background = names == 0
-            names = np.concatenate([names[~background], names[background & (areas > SMALL_MASK)]])
-            extra = {"num_bg": int((names == 0).any())}
-        masks = labels[None] == names[:, None, None]
-        encoded = [_runs(mask) for mask in masks] if self.runs else encode(masks)
-        return {"masks": encoded, "ids": [int(name) + self._offset for name in names], **extra}
+    def _mask(self, frame: Integer[np.ndarray, "H W"], name: int) -> dict[str, Any]:
+        mask = frame == name
+        (code,) = encode(mask[None])
+        found = {"category_id": CATEGORY["id"], "track_id": name, "segmentation": code}
+        if not self.truth:
+            return {**found, "score": 1.0}  # without a box: loadRes would take the box's area for the mask's
+        rows, columns = np.nonzero(mask)
+        box = (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)
+        more = {"id": len(self._masks) + 1, "iscrowd": int(name == self.ignore_label), "area": int(mask.sum())}
+        return {**more, **found, "bbox": [float(value) for value in box]}
 
     def __enter__(self) -> CocoWriter:
         return self
@@ -76,144 +82,154 @@ class CocoWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.write("[]" if self._separator == "[" else "]\n")
-        self._file.close()
-        if kind is None:
-            os.replace(self._draft, self.path)
-        else:
-            self._draft.unlink()
+        if kind is not None:
+            return
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        draft = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        page = {
+            "info": {"description": "ground truth, written by apex_lab"},
+            "licenses": [],
+            "categories": [CATEGORY],
+            "videos": self._videos,
+            "images": self._images,
+            "annotations": self._masks,
+        }
+        draft.write_text(json.dumps(page if self.truth else self._masks) + "\n", encoding="utf-8")
+        os.replace(draft, self.path)
 
 
-def read_coco(path: str | Path, sizes: Sequence[tuple[int, int, int]]) -> Iterator[Int64[np.ndarray, "T H W"]]:
-    """Identity maps of the videos of a file, one at a time.
+def read_results(
+    results: Sequence[Any], path: Path, places: Places, shapes: Mapping[str, tuple[int, int, int]]
+) -> Iterator[tuple[str, Int64[np.ndarray, "T H W"]]]:
+    """Identity maps of the videos that a result list tells of, in the order of `shapes`.
+
+    Pixels of no mask form one more segment over the whole video; see `video.with_rest`.
 
     Args:
-        path: the file.
-        sizes: (T, H, W) of every video, in order.
+        results: content of the file.
+        path: of it, for messages.
+        places: of every image of the ground truth.
+        shapes: name -> (T, H, W) of every video to read.
 
     Raises:
-        UserError: another number of videos or frames, masks of another size or that meet, ids that repeat in a frame.
+        UserError: entries without image, track or mask, of images that the ground truth does not have, or masks of
+            another size or that overlap.
     """
-    path = Path(path)
-    try:
-        videos = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise UserError(f"there is no file {path}") from error
-    except (ValueError, OSError) as error:
-        raise UserError(f"{path} is no readable JSON file ({error})") from error
-    if not isinstance(videos, list) or not all(isinstance(video, list) for video in videos):
-        raise UserError(f"{path} must hold a list of videos, each a list of frames")
-    if len(videos) != len(sizes):
-        raise UserError(f"{path} holds {len(videos)} videos, the ground truth {len(sizes)}")
-    for number, (frames, shape) in enumerate(zip(videos, sizes, strict=True)):
-        where = f"{path}, video {number}"
-        if len(frames) != shape[0]:
-            raise UserError(f"{where}: has {len(frames)} frames, the ground truth {shape[0]}")
-        yield _identities(frames, shape, where)
+    by_video: dict[str, list[tuple[int, int, Any, str]]] = {}
+    seen = set()
+    for number, entry in enumerate(results):
+        where = f"{path}, result {number}"
+        image, track, mask = _entry(entry, where)
+        if image not in places:
+            raise UserError(f"{where}: image {image} is none of the {len(places)} images of the ground truth")
+        if (image, track) in seen:
+            raise UserError(f"{where}: image {image} has the track_id {track} more than once; give each mask its own")
+        seen.add((image, track))
+        video, frame = places[image]
+        by_video.setdefault(video, []).append((frame, track, mask, where))
+    for name, shape in shapes.items():
+
+        def place(found: Int64[np.ndarray, "T H W"], name: str = name) -> None:
+            for frame, track, mask, where in by_video.get(name, []):
+                paint(found[frame], mask, track, ABSENT, where)
+
+        yield name, with_rest(place, shape)
 
 
-def _identities(frames: list[Any], shape: tuple[int, int, int], where: str) -> Int64[np.ndarray, "T H W"]:
-    def place(found: Int64[np.ndarray, "T H W"]) -> None:
-        for t, frame in enumerate(frames):
-            here = f"{where}, frame {t}"
-            for name, mask in _checked(frame, here):
-                pixels = decode(mask, shape[1:], here)
-                if (found[t][pixels] != ABSENT).any():
-                    raise UserError(f"{here}: the mask of id {name} covers pixels of another; masks must not overlap")
-                found[t][pixels] = name
-
-    return with_rest(place, shape)
+def videos_with_results(results: Sequence[Any], path: Path, places: Places) -> set[str]:
+    """Names of the videos that a result list tells of."""
+    images = {_entry(entry, f"{path}, result {number}")[0] for number, entry in enumerate(results)}
+    return {places[image][0] for image in images if image in places}
 
 
-def _checked(frame: Any, where: str) -> list[tuple[int, Any]]:
-    """Ids and masks of one frame."""
-    try:
-        masks, ids = frame["masks"], frame["ids"]
-        pairs = list(zip(ids, masks, strict=True))
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{where}: want {{'masks': [...], 'ids': [...]}} of one length") from error
-    for name in ids:
-        if type(name) is not int or name < 0:
-            raise UserError(f"{where}: the id {name!r} is no integer >= 0")
-        if ids.count(name) > 1:
-            raise UserError(f"{where}: has the id {name} more than once; an identity can be in one place only")
-    return pairs
+def _entry(entry: Any, where: str, truth: bool = False) -> tuple[int, int, Any]:
+    """Image, track and mask of a result or an annotation."""
+    if not isinstance(entry, dict):
+        raise UserError(f"{where}: want an object with image_id, track_id and segmentation, got {str(entry)[:40]!r}")
+    for key in ("image_id", "track_id"):
+        value = entry.get(key)
+        if type(value) is not int or (value < 0 and not truth):
+            raise UserError(
+                f"{where}: {key} is {value!r}; want an integer >= 0 (where identities mean nothing over time, number "
+                "the masks of each image and set scoring.identities=none)"
+            )
+    if "segmentation" not in entry:
+        raise UserError(f"{where}: the key segmentation is missing; boxes hold no masks and cannot be scored")
+    return entry["image_id"], entry["track_id"], entry["segmentation"]
 
 
-def decode(mask: Any, size: tuple[int, int], where: str) -> Bool[np.ndarray, "H W"]:
-    """One mask of either kind.
+class CocoTruth:
+    """Ground truth with images, annotations and videos: `CocoWriter(truth=True)` or `python -m sims.p2d export`.
 
     Args:
-        mask: COCO's run-length encoding, compressed or not, or a string of starts and lengths.
-        size: height and width that it must have.
-        where: for messages.
+        page: content of the file.
+        path: of it, for messages.
+
+    Raises:
+        UserError: images that do not say to which frame of which video they belong.
     """
-    if isinstance(mask, str):
-        return _from_runs(mask, size, where)
-    try:
-        height, width = mask["size"]
-        counts = mask["counts"]
-        lengths = np.array(_unpack(counts) if isinstance(counts, str) else counts, dtype=np.int64)
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise UserError(f"{where}: a mask is no run-length encoding ({error!r})") from error
-    if (height, width) != size:
-        raise UserError(f"{where}: a mask is {height} x {width}, the ground truth {size[0]} x {size[1]}")
-    if lengths.ndim != 1 or (lengths < 0).any() or lengths.sum() != height * width:
-        raise UserError(f"{where}: the runs of a mask do not fill its {height} x {width} pixels; it is damaged")
-    # Runs of zeros and ones in turn, down the columns.
-    pixels = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
-    return pixels.reshape(width, height).T
 
-
-def _unpack(text: str) -> list[int]:
-    """The run lengths that COCO's compressed string stands for.
-
-    Each number is written in groups of five bits, lowest first, a sixth bit says that more follow; from the fourth
-    number on, the difference to the one two before is written. (pycocotools does not notice when runs do not fill the
-    image, and returns memory that nobody has written.)
-    """
-    lengths: list[int] = []
-    number, shift = 0, 0
-    for character in text:
-        bits = ord(character) - 48
-        if not 0 <= bits < 64:
-            raise ValueError(f"{character!r} is no character of a compressed mask")
-        number |= (bits & 31) << shift
-        shift += 5
-        if bits & 32:
-            continue
-        if bits & 16:
-            number -= 1 << shift
-        lengths.append(number + (lengths[-2] if len(lengths) > 2 else 0))
-        number, shift = 0, 0
-    if shift:
-        raise ValueError("a compressed mask ends in the middle of a number")
-    return lengths
-
-
-def encode(masks: Bool[np.ndarray, "N H W"]) -> list[dict[str, Any]]:
-    """COCO's run-length encoding of N masks."""
-    encoded = coco.encode(np.asfortranarray(masks.transpose(1, 2, 0), dtype=np.uint8))
-    return [{"size": list(rle["size"]), "counts": rle["counts"].decode("ascii")} for rle in encoded]
-
-
-def _runs(mask: Bool[np.ndarray, "H W"]) -> str:
-    """Starts (from 1, row by row) and lengths of the runs of ones."""
-    edges = np.flatnonzero(np.diff(np.pad(mask.ravel().astype(np.int8), 1)))
-    return " ".join(f"{start + 1} {end - start}" for start, end in edges.reshape(-1, 2).tolist())
-
-
-def _from_runs(runs: str, size: tuple[int, int], where: str) -> Bool[np.ndarray, "H W"]:
-    try:
-        pairs = np.array([int(word) for word in runs.split()], dtype=np.int64).reshape(-1, 2)
-    except ValueError as error:
-        raise UserError(f"{where}: {runs[:40]!r} is no list of starts and lengths") from error
-    found = np.zeros(size[0] * size[1], dtype=bool)
-    for start, length in pairs.tolist():
-        # Cut off silently, a mask of another image size would decode to something else.
-        if start < 1 or length < 1 or start - 1 + length > len(found):
+    def __init__(self, page: Mapping[str, Any], path: Path) -> None:
+        self._path = path
+        try:
+            names = {video["id"]: str(video["name"]) for video in page["videos"]}
+            images = {
+                image["id"]: (names[image["video_id"]], int(image["frame_id"]), image["height"], image["width"])
+                for image in page["images"]
+            }
+            annotations = list(page["annotations"])
+        except (KeyError, TypeError, ValueError) as error:
             raise UserError(
-                f"{where}: a run of {length} pixels from {start} on does not lie in an image of {size[0]} x {size[1]}"
-            )
-        found[start - 1 : start - 1 + length] = True
-    return found.reshape(size)
+                f"{path} lacks {error}: ground truth in COCO's layout needs videos (id, name), images (id, width, "
+                "height, video_id, frame_id) and annotations"
+            ) from error
+        self.names = list(names.values())
+        self._frames: dict[str, list[int]] = {name: [] for name in self.names}
+        self._sizes: dict[str, tuple[int, int]] = {}
+        for name, frame, height, width in images.values():
+            self._frames[name].append(frame)
+            if self._sizes.setdefault(name, (height, width)) != (height, width):
+                raise UserError(f"{path}: the images of video {name!r} differ in size; they must be alike")
+        for name, frames in self._frames.items():
+            if not frames or len(set(frames)) < len(frames) or self.names.count(name) > 1:
+                raise UserError(
+                    f"{path}: video {name!r} has no image, two of one frame_id, or another video of its name; "
+                    "correct the file"
+                )
+            frames.sort()
+        self.places = {number: (name, self._frames[name].index(frame)) for number, (name, frame, *_) in images.items()}
+        self._annotations: dict[str, list[tuple[int, int, Any, str]]] = {name: [] for name in self.names}
+        self._void: dict[str, int] = {}
+        for number, annotation in enumerate(annotations):
+            where = f"{path}, annotation {number}"
+            image, track, mask = _entry(annotation, where, truth=True)
+            if image not in self.places:
+                raise UserError(f"{where}: there is no image {image}")
+            name, place = self.places[image]
+            if annotation.get("iscrowd"):
+                self._void.setdefault(name, track)
+            elif track <= BACKGROUND:
+                raise UserError(f"{where}: the track_id is {track}, 0 is the background; number objects from 1 on")
+            self._annotations[name].append((place, track, mask, where))
+
+    def labels(self, name: str) -> Int64[np.ndarray, "T H W"]:
+        """True labels of one video: the track ids; pixels of no annotation are background.
+
+        Raises:
+            UserError: masks that are damaged, of another size or that overlap.
+        """
+        found = np.full((len(self._frames[name]), *self._sizes[name]), UNPAINTED, dtype=np.int64)
+        for frame, track, mask, where in self._annotations[name]:
+            paint(found[frame], mask, track, UNPAINTED, where, "the image")
+        return np.where(found == UNPAINTED, BACKGROUND, found)
+
+    def metadata(self, name: str) -> None:
+        """Nothing is known."""
+
+    def numbers(self, name: str) -> list[int]:
+        """`frame_id` of its images."""
+        return self._frames[name]
+
+    def void(self, name: str) -> int | None:
+        """A label that this video marks as a region to ignore (`iscrowd`)."""
+        return self._void.get(name)

@@ -1,7 +1,10 @@
 """Predictions as DAVIS-style PNGs: a folder per video, a palette image per frame, its index the identity.
 
 Identities are numbered 1, 2, ... per video in the order of their values; index 0 is the background where it is known.
-What identities are called does not matter to any metric, so nothing is lost. A palette has room for 255 of them.
+What identities are called does not matter to any metric, so nothing is lost. A palette has room for 254 of them: 255
+is DAVIS's mark of pixels to ignore, and in ground truth the ignored label is written so.
+
+Palette and grey images are read, of 1 to 16 bits. The number in a file's name says which frame it is.
 """
 
 from __future__ import annotations
@@ -15,9 +18,15 @@ from jaxtyping import Int64, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from apex_lab.base.errors import UserError
-from apex_lab.formats.video import PredictedVideo
+from apex_lab.formats.frames import numbered
+from apex_lab.formats.video import PredictedVideo, labels_of
+from apex_lab.metrics.order import natural_key
 
-MAX_INDEX = 255
+VOID_INDEX = 255
+MAX_INDEX = 254
+
+LABEL_MODES = ("P", "L", "1", "I", "I;16", "I;16B", "I;16L")
+"""Pillow's names of images with one number per pixel; 16-bit PNGs are I;16, or I in older versions."""
 
 
 class DavisWriter:
@@ -26,10 +35,11 @@ class DavisWriter:
     Args:
         path: the folder.
         truth: write `PredictedVideo.truth` in place of the prediction; labels are the indices.
+        ignore_label: this true label becomes index 255.
     """
 
-    def __init__(self, path: str | Path, truth: bool = False) -> None:
-        self.path, self.truth = Path(path), truth
+    def __init__(self, path: str | Path, truth: bool = False, ignore_label: int | None = None) -> None:
+        self.path, self.truth, self.ignore_label = Path(path), truth, ignore_label
         self.path.mkdir(parents=True, exist_ok=True)
 
     def add(self, video: PredictedVideo) -> None:
@@ -52,9 +62,10 @@ class DavisWriter:
 
     def _indices(self, video: PredictedVideo) -> UInt8[np.ndarray, "T H W"]:
         if self.truth:
-            if video.truth is None:
-                raise ValueError(f"video {video.name!r} has no ground truth to write")
-            largest, indices = int(video.truth.max()), video.truth
+            labels = labels_of(video, truth=True)
+            ignored = labels == (VOID_INDEX if self.ignore_label is None else self.ignore_label)
+            largest = int(labels.max(where=~ignored, initial=0))
+            indices = np.where(ignored, VOID_INDEX, labels)
         else:
             names, inverse = np.unique(video.identities, return_inverse=True)
             is_background = np.isin(names, list(video.background_ids))
@@ -77,19 +88,32 @@ class DavisWriter:
 
 
 def video_names(path: str | Path) -> list[str]:
-    """The sub-folders of a folder that hold PNGs, in order."""
-    return sorted({image.parent.name for image in Path(path).glob("[!.]*/*.png")})
+    """The sub-folders of a folder that hold PNGs, in natural order (v2 before v10)."""
+    names = {file.parent.name for file in Path(path).glob("[!.]*/[!.]*") if file.suffix.lower() == ".png"}
+    return sorted(names, key=natural_key)
+
+
+def frame_files(path: str | Path, name: str) -> dict[int, Path]:
+    """The PNGs of one video by the number of their frame, ascending.
+
+    Raises:
+        UserError: no such video, or names that do not count frames.
+    """
+    folder = Path(path) / name
+    files = sorted(file for file in folder.glob("[!.]*") if file.suffix.lower() == ".png")
+    if not files:
+        raise UserError(f"{path} has no folder {name} with PNGs, one per frame")
+    return numbered(files, str(folder))
 
 
 def read_davis(path: str | Path, name: str) -> Int64[np.ndarray, "T H W"]:
-    """Indices of one video, frames in the order of their file names.
+    """Indices of one video, frames in the order of their numbers.
 
     Raises:
-        UserError: no such video, images of different sizes, or with colours in place of indices.
+        UserError: no such video, names that do not count frames, images of different sizes, or with colours in place
+            of indices.
     """
-    files = sorted((Path(path) / name).glob("*.png"))
-    if not files:
-        raise UserError(f"{path} has no folder {name} with PNGs, one per frame")
+    files = list(frame_files(path, name).values())
     frames = [_indices_of(file) for file in files]
     for file, frame in zip(files, frames, strict=True):
         if frame.shape != frames[0].shape:
@@ -100,11 +124,20 @@ def read_davis(path: str | Path, name: str) -> Int64[np.ndarray, "T H W"]:
 def _indices_of(file: Path) -> Int64[np.ndarray, "H W"]:
     try:
         with Image.open(file) as image:
-            if image.mode not in ("P", "L"):
+            if image.mode not in LABEL_MODES:
                 raise UserError(f"{file} is a {image.mode} image; want one index per pixel (a palette or grey image)")
-            return np.asarray(image).astype(np.int64)
+            # Grey of 2 or 4 bits comes stretched to 0 to 255; labels are what is stored.
+            stretched = {"L;2": 85, "L;4": 17}.get(_raw_mode(image), 1)
+            return np.asarray(image).astype(np.int64) // stretched
     except (UnidentifiedImageError, OSError, SyntaxError) as error:
         raise UserError(f"{file} is no readable PNG ({error})") from error
+
+
+def _raw_mode(image: Image.Image) -> str:
+    """How the file stores its pixels, in Pillow's words."""
+    tiles = getattr(image, "tile", None)
+    arguments = tiles[0][3] if tiles else ""
+    return str(arguments if isinstance(arguments, str) else arguments[0])
 
 
 def palette() -> UInt8[np.ndarray, "256 3"]:

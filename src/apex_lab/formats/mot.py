@@ -1,8 +1,21 @@
-"""Predictions as MOTChallenge text: boxes for tools that read tracks, and MOTS lines that hold the masks too.
+"""Writes predictions as MOTChallenge text: boxes for tools that read tracks, and MOTS lines that hold the masks too.
 
-One file `V.txt` per video. Boxes: `frame, id, left, top, width, height, confidence, -1, -1, -1`, all counted from 1 as
-the MOTChallenge wants it; the background is left out where it is known. MOTS: `frame id class height width mask`, the
-mask in COCO's run-length encoding. Boxes alone cannot be scored here, since every metric needs masks.
+One file `V.txt` per video V; frames and ids are counted from 1, as the MOTChallenge wants it, and the background is
+left out where it is known.
+
+| | prediction | ground truth |
+| --- | --- | --- |
+| boxes | `frame,id,left,top,width,height,1,-1,-1,-1` | `frame,id,left,top,width,height,1,1,visibility` |
+| MOTS | `frame id 2 height width mask` | the same, and class 10 for a region to ignore |
+
+The id of a prediction is its identity + 1, that of a true object its label, as in `python -m sims.p2d export --format
+mot`. Classes are those of pedestrians, 1 and 2, since evaluation kits for pedestrians pass over all others. Masks are
+in COCO's run-length encoding. Visibility is the share of the object that is seen, 1 where that is not known. A region
+to ignore keeps its label as its id where it is above 0; else its id is 10000.
+
+Beside ground truth lie `V/seqinfo.ini` (length and size of V) and `seqmaps/all.txt` (all names), so TrackEval's
+`MotChallenge2DBox` and `MOTSChallenge` read it with `GT_LOC_FORMAT='{gt_folder}/{seq}.txt'`, `SKIP_SPLIT_FOL=True`,
+`SEQMAP_FILE='<ground truth>/seqmaps/all.txt'` and `TRACKER_SUB_FOLDER=''`.
 """
 
 from __future__ import annotations
@@ -12,16 +25,22 @@ from pathlib import Path
 from types import TracebackType
 
 import numpy as np
-from jaxtyping import Int64, Integer
+from jaxtyping import Float64, Integer
 
-from apex_lab.base.errors import UserError
-from apex_lab.formats.coco import decode, encode
 from apex_lab.formats.davis import plain_name
-from apex_lab.formats.video import PredictedVideo, with_rest
-from apex_lab.scene import ABSENT
+from apex_lab.formats.rle import encode
+from apex_lab.formats.video import PredictedVideo, labels_of
+from apex_lab.metrics.contingency import BACKGROUND
+from apex_lab.metrics.objects import ObjectMetadata
 
-MOTS_CLASS = 1
-"""There is one class of objects here; MOTS wants a number for it."""
+BOX_CLASS, MASK_CLASS, IGNORED_CLASS = 1, 2, 10
+"""A pedestrian among boxes, a pedestrian among masks, a region to ignore among masks."""
+
+IGNORED_ID = 10000
+"""MOTS's id of regions to ignore."""
+
+FRAME_RATE = 10
+"""Nominal: seqinfo.ini has to name one."""
 
 
 class MotWriter:
@@ -31,11 +50,15 @@ class MotWriter:
         path: the folder.
         masks: MOTS lines in place of boxes.
         truth: write `PredictedVideo.truth` (its label 0 left out) in place of the prediction.
+        ignore_label: pixels of this true label are a region to ignore; boxes leave them out.
     """
 
-    def __init__(self, path: str | Path, masks: bool = False, truth: bool = False) -> None:
-        self.path, self.masks, self.truth = Path(path), masks, truth
+    def __init__(
+        self, path: str | Path, masks: bool = False, truth: bool = False, ignore_label: int | None = None
+    ) -> None:
+        self.path, self.masks, self.truth, self.ignore_label = Path(path), masks, truth, ignore_label
         self.path.mkdir(parents=True, exist_ok=True)
+        self._names: list[str] = []
 
     def add(self, video: PredictedVideo) -> None:
         """Writes one video.
@@ -43,20 +66,49 @@ class MotWriter:
         Raises:
             UserError: a name that is no file name.
         """
-        labels = video.truth if self.truth else video.identities
-        if labels is None:
-            raise ValueError(f"video {video.name!r} has no ground truth to write")
-        left_out = {0} if self.truth else set(video.background_ids)
-        lines = [
-            _mask_line(t, name, frame) if self.masks else _box_line(t, name, frame)
-            for t, frame in enumerate(labels)
-            for name in np.unique(frame).tolist()
-            if name not in left_out
-        ]
-        file = self.path / f"{plain_name(video.name)}.txt"
-        draft = file.with_name(f".{file.name}.{os.getpid()}")
-        draft.write_text("".join(f"{line}\n" for line in lines), encoding="ascii")
-        os.replace(draft, file)
+        labels, name = labels_of(video, self.truth), plain_name(video.name)
+        left_out = {BACKGROUND} if self.truth else set(video.background_ids)
+        if self.truth and not self.masks and self.ignore_label is not None:
+            left_out.add(self.ignore_label)
+        visible = _visibility(video.objects, len(labels)) if self.truth and not self.masks else {}
+        lines = []
+        for t, frame in enumerate(labels):
+            for label in np.unique(frame).tolist():
+                if label in left_out:
+                    continue
+                if self.masks:
+                    lines.append(self._mask_line(t, label, frame))
+                else:
+                    share = float(visible[label][t]) if label in visible else 1.0
+                    lines.append(self._box_line(t, label, frame, share))
+        _write(self.path / f"{name}.txt", lines)
+        if self.truth:
+            (self.path / name).mkdir(exist_ok=True)
+            frames, height, width = labels.shape
+            about = {"name": name, "imDir": "img1", "frameRate": FRAME_RATE, "seqLength": frames}
+            about |= {"imWidth": width, "imHeight": height, "imExt": ".png"}
+            _write(
+                self.path / name / "seqinfo.ini", ["[Sequence]", *(f"{key}={value}" for key, value in about.items())]
+            )
+            self._names.append(name)
+
+    def _box_line(self, frame: int, label: int, labels: Integer[np.ndarray, "H W"], visible: float) -> str:
+        rows, columns = np.nonzero(labels == label)
+        top, left = rows.min(), columns.min()
+        height, width = rows.max() - top + 1, columns.max() - left + 1
+        end = f"{BOX_CLASS},{visible:.4f}" if self.truth else "-1,-1,-1"
+        return f"{frame + 1},{self._id(label)},{left + 1},{top + 1},{width},{height},1,{end}"
+
+    def _mask_line(self, frame: int, label: int, labels: Integer[np.ndarray, "H W"]) -> str:
+        height, width = labels.shape
+        (mask,) = encode((labels == label)[None])
+        kind = IGNORED_CLASS if self.truth and label == self.ignore_label else MASK_CLASS
+        return f"{frame + 1} {self._id(label)} {kind} {height} {width} {mask['counts']}"
+
+    def _id(self, label: int) -> int:
+        if not self.truth:
+            return label + 1
+        return label if label > 0 else IGNORED_ID
 
     def __enter__(self) -> MotWriter:
         return self
@@ -64,67 +116,20 @@ class MotWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Nothing is left open."""
+        if kind is None and self.truth:
+            (self.path / "seqmaps").mkdir(exist_ok=True)
+            _write(self.path / "seqmaps" / "all.txt", ["name", *self._names])
 
 
-def _box_line(frame: int, name: int, labels: Integer[np.ndarray, "H W"]) -> str:
-    rows, columns = np.nonzero(labels == name)
-    top, left = rows.min(), columns.min()
-    height, width = rows.max() - top + 1, columns.max() - left + 1
-    return f"{frame + 1},{name + 1},{left + 1},{top + 1},{width},{height},1,-1,-1,-1"
+def _visibility(objects: ObjectMetadata | None, frames: int) -> dict[int, Float64[np.ndarray, " T"]]:
+    """Label -> visible share per frame, where it is known; 0 where nothing would be seen anyway."""
+    if objects is None or objects.occlusion is None or len(objects.occlusion) != frames:
+        return {}
+    shares = np.clip(1 - np.nan_to_num(np.asarray(objects.occlusion, dtype=np.float64), nan=1.0), 0, 1)
+    return {int(label): shares[:, place] for place, label in enumerate(objects.labels)}
 
 
-def _mask_line(frame: int, name: int, labels: Integer[np.ndarray, "H W"]) -> str:
-    height, width = labels.shape
-    (mask,) = encode((labels == name)[None])
-    return f"{frame + 1} {name + 1} {MOTS_CLASS} {height} {width} {mask['counts']}"
-
-
-def read_mots(path: str | Path, name: str, shape: tuple[int, int, int]) -> Int64[np.ndarray, "T H W"]:
-    """Identity map of one video from its MOTS lines.
-
-    Pixels of no mask form one more segment over the whole video; see `video.with_rest`.
-
-    Args:
-        path: the folder.
-        name: of the video.
-        shape: (T, H, W) of the ground truth.
-
-    Raises:
-        UserError: no such file, a line of another kind (boxes hold no masks), masks that overlap or have another size.
-    """
-    file = Path(path) / f"{name}.txt"
-    if not file.is_file():
-        raise UserError(f"there is no file {file} for video {name!r}")
-
-    def place(found: Int64[np.ndarray, "T H W"]) -> None:
-        seen = set()
-        for number, line in enumerate(file.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
-            here = f"{file}, line {number}"
-            frame, identity, mask = _parse(line, here)
-            if not 0 <= frame < shape[0]:
-                raise UserError(f"{here}: frame {frame + 1} is none of the {shape[0]} of the ground truth")
-            if (frame, identity) in seen:
-                raise UserError(f"{here}: frame {frame + 1} has the id {identity + 1} more than once")
-            seen.add((frame, identity))
-            pixels = decode(mask, shape[1:], here)
-            if (found[frame][pixels] != ABSENT).any():
-                raise UserError(f"{here}: the mask covers pixels of another; masks must not overlap")
-            found[frame][pixels] = identity
-
-    return with_rest(place, shape)
-
-
-def _parse(line: str, where: str) -> tuple[int, int, dict[str, object]]:
-    """Frame and identity, counted from 0, and the mask."""
-    words = line.split()
-    if line.count(",") >= 6:
-        raise UserError(f"{where}: MOTChallenge boxes hold no masks and cannot be scored; write MOTS lines")
-    try:
-        frame, identity, _, height, width = (int(word) for word in words[:5])
-        counts = words[5]
-    except (ValueError, IndexError) as error:
-        raise UserError(f"{where}: want 'frame id class height width mask', got {line[:60]!r}") from error
-    if identity < 1 or len(words) != 6:
-        raise UserError(f"{where}: want 'frame id class height width mask' with an id from 1, got {line[:60]!r}")
-    return frame - 1, identity - 1, {"size": [height, width], "counts": counts}
+def _write(file: Path, lines: list[str]) -> None:
+    draft = file.with_name(f".{file.name}.{os.getpid()}")
+    draft.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    os.replace(draft, file)

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
-from apex_lab.formats.video import PredictedVideo, check_labels, hard_segmentation, resized
+from apex_lab.formats.video import PredictedVideo, hard_segmentation, resized
 from apex_lab.scene import ABSENT
 
 PARTS = ("gt", "masks", "ids")
@@ -71,11 +71,9 @@ class NpzFile:
         """Ground truth of one video.
 
         Raises:
-            UserError: damaged, or a negative label.
+            UserError: damaged.
         """
-        labels = self._read(f"{name}__gt")
-        check_labels(labels, self.where(name))
-        return labels
+        return self._read(f"{name}__gt")
 
     def identities(self, name: str, size: tuple[int, int] | None = None) -> Int64[np.ndarray, "T H W"]:
         """Identity of the winning slot at every pixel, with the masks brought to another size first where given.

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int64, Integer, Shaped
 
 from apex_lab.base.errors import UserError
 from apex_lab.metrics.evaluator import MAX_IDENTITY
+from apex_lab.metrics.objects import ObjectMetadata
 from apex_lab.scene import ABSENT
 
 SUM_TOLERANCE = 1e-3
@@ -29,6 +30,7 @@ class PredictedVideo:
         masks: soft masks, sum 1 over K; None where only the winners are known.
         ids: identity of each slot, -1 for an absent one.
         background_ids: which identities are background, where that is known.
+        objects: what else is known of the true objects.
     """
 
     name: str
@@ -37,6 +39,20 @@ class PredictedVideo:
     masks: Shaped[np.ndarray, "T K H W"] | None = None
     ids: Integer[np.ndarray, "T K"] | None = None
     background_ids: Collection[int] = ()
+    objects: ObjectMetadata | None = None
+
+
+def labels_of(video: PredictedVideo, truth: bool) -> Integer[np.ndarray, "T H W"]:
+    """The predicted identities of a video, or its true labels.
+
+    Raises:
+        ValueError: it has no ground truth.
+    """
+    if not truth:
+        return video.identities
+    if video.truth is None:
+        raise ValueError(f"video {video.name!r} has no ground truth to write")
+    return video.truth
 
 
 def hard_segmentation(
@@ -87,11 +103,15 @@ def check_ids(ids: Integer[np.ndarray, "T K"], where: str) -> None:
             )
 
 
-def check_labels(truth: Integer[np.ndarray, "T H W"], where: str) -> None:
-    """Refuses negative ground truth, and labels above 2^53."""
-    message = "the ground truth is {} at {}; 'ignore' labels are not supported, 0 is the background"
-    _refuse(truth < 0, where, message, truth)
-    _refuse(truth > MAX_IDENTITY, where, "the ground truth is {} at {}; labels end at 2^53", truth)
+def check_labels(truth: Integer[np.ndarray, "T H W"], where: str, ignore_label: int | None = None) -> None:
+    """Refuses negative ground truth, and labels above 2^53, apart from the label that is to be ignored."""
+    counted = np.ones(truth.shape, dtype=bool) if ignore_label is None else truth != ignore_label
+    message = (
+        "the ground truth is {} at {}; labels are >= 0, 0 is the background; scoring.ignore_label leaves pixels of one "
+        "label out, whatever its number"
+    )
+    _refuse((truth < 0) & counted, where, message, truth)
+    _refuse((truth > MAX_IDENTITY) & counted, where, "the ground truth is {} at {}; labels end at 2^53", truth)
 
 
 def fit(

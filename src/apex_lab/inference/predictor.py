@@ -58,7 +58,9 @@ class Predictor:
         self.model.eval()
         video = as_float(batch["video"].to(self.device))
         if self.model.needs_labels:
-            return self.model.from_labels(video, batch["segmentation"].to(self.device).long())
+            return self.model.from_labels(
+                video, batch["segmentation"].to(self.device).long(), Context(self.schedule, detail=detail)
+            )
         chunk = self.chunk or video.shape[1]
         scenes: list[Scene] = []
         for start in range(0, video.shape[1], chunk):

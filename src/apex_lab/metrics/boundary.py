@@ -25,7 +25,7 @@ TOLERANCE = 0.008
 
 @dataclass(frozen=True)
 class BoundaryScores:
-    """J and F of the O objects of one video, per frame."""
+    """J and F of the O objects of one video, per frame; NaN in a frame of which every pixel is ignored."""
 
     j: Float64[np.ndarray, "O T"]
     f: Float64[np.ndarray, "O T"]
@@ -43,6 +43,7 @@ def boundary_scores(
     labels: Int64[np.ndarray, " G"],
     ids: Int64[np.ndarray, " P"],
     tolerance: float = TOLERANCE,
+    ignored: Bool[np.ndarray, "T H W"] | None = None,
 ) -> BoundaryScores:
     """Scores the objects of one video in the order of `labels[1:]`.
 
@@ -51,13 +52,17 @@ def boundary_scores(
         truth: labels, 0 is the background.
         counts, labels, ids: their contingency table.
         tolerance: share of the image diagonal.
+        ignored: pixels that the table does not count; they belong to no mask. Frames without any other pixel are NaN.
     """
     j, partner = assign_tracks(counts)
     found = prediction[:, None] == np.append(ids, -1)[partner][:, None, None]
     true = truth[:, None] == labels[1:, None, None]
+    if ignored is not None:
+        found, true = found & ~ignored[:, None], true & ~ignored[:, None]
     radius = tolerance_px(truth.shape[1:], tolerance)
     f = np.array([boundary_measure(*masks, radius) for masks in zip(found, true, strict=True)])
-    return BoundaryScores(j, f.reshape(len(truth), -1).T)
+    scored = counts.sum(axis=(1, 2)) > 0
+    return BoundaryScores(np.where(scored, j, np.nan), np.where(scored, f.reshape(len(truth), -1).T, np.nan))
 
 
 def assign_tracks(counts: Int64[np.ndarray, "T G P"]) -> tuple[Float64[np.ndarray, "O T"], Int64[np.ndarray, " O"]]:

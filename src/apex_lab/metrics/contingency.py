@@ -44,39 +44,51 @@ class Contingency:
         return self.counts[:, :, 1:].sum(dim=(2, 3)) == 0
 
 
-def contingency(prediction: Labels, truth: Labels) -> Contingency:
+def contingency(prediction: Labels, truth: Labels, ignore_label: int | None = None) -> Contingency:
     """Counts shared pixels per frame; one identity has one column over the whole video.
 
     Args:
         prediction: predicted identities, >= 0; what they are called does not matter.
         truth: true labels, >= 0; 0 is the background.
+        ignore_label: pixels of this true label are not counted, and neither it nor an identity that only such pixels
+            have gets a row or column; it may be negative.
 
     Raises:
         ValueError: the shapes differ, are no (B, T, H, W), or hold no pixel; a label is negative.
         TypeError: labels that are no integers.
     """
-    check_labels(prediction, truth)
+    check_labels(prediction, truth, ignore_label)
     videos, frames = truth.shape[:2]
-    rows, labels = compact(truth.flatten(1).long(), keep_zero=True)
-    columns, ids = compact(prediction.flatten(1).long())
+    ignored = None if ignore_label is None else (truth.long() == ignore_label).flatten(1)
+    rows, labels = compact(truth.flatten(1).long(), keep_zero=True, left_out=ignored)
+    columns, ids = compact(prediction.flatten(1).long(), left_out=ignored)
     n_rows, n_columns = labels.shape[1], ids.shape[1]
     frame = torch.arange(videos * frames, device=truth.device).view(videos, frames, 1)
     cell = (frame * n_rows + rows.view(videos, frames, -1)) * n_columns + columns.view(videos, frames, -1)
-    counts = torch.bincount(cell.flatten(), minlength=videos * frames * n_rows * n_columns)
+    counted = cell.flatten() if ignored is None else cell[~ignored.view_as(cell)]
+    counts = torch.bincount(counted, minlength=videos * frames * n_rows * n_columns)
     return Contingency(counts.view(videos, frames, n_rows, n_columns), labels, ids)
 
 
-def compact(labels: Int64[Tensor, "S N"], keep_zero: bool = False) -> tuple[Int64[Tensor, "S N"], Int64[Tensor, "S L"]]:
+def compact(
+    labels: Int64[Tensor, "S N"], keep_zero: bool = False, left_out: Bool[Tensor, "S N"] | None = None
+) -> tuple[Int64[Tensor, "S N"], Int64[Tensor, "S L"]]:
     """Renames the labels of every set to 0, 1, ... in ascending order.
 
     Args:
         labels: >= 0.
         keep_zero: label 0 keeps the name 0 in every set, whether it occurs or not.
+        left_out: points whose label does not count as one that occurs; their new label means nothing. A set without
+            any other point gets the label 0.
 
     Returns:
         the renamed labels, and the old label of each new one (L is the largest number of labels in a set, `PAD`
         fills the rest).
     """
+    if left_out is not None:
+        # Points that are left out take a label that the set has anyway.
+        first = labels.masked_fill(left_out, torch.iinfo(torch.int64).max).amin(dim=1, keepdim=True)
+        labels = torch.where(left_out, torch.where(left_out.all(dim=1, keepdim=True), 0, first), labels)
     largest = int(labels.max())
     if largest < _MAX_SPAN:
         names = torch.arange(largest + 1, device=labels.device)
@@ -93,7 +105,7 @@ def compact(labels: Int64[Tensor, "S N"], keep_zero: bool = False) -> tuple[Int6
     return rank.gather(1, labels), old
 
 
-def check_labels(prediction: Tensor, truth: Tensor) -> None:
+def check_labels(prediction: Tensor, truth: Tensor, ignore_label: int | None = None) -> None:
     """Refuses label maps that no metric can read; see `contingency` for the errors."""
     for name, labels in (("prediction", prediction), ("truth", truth)):
         if labels.ndim != 4:
@@ -107,10 +119,12 @@ def check_labels(prediction: Tensor, truth: Tensor) -> None:
         )
     if truth.numel() == 0:
         raise ValueError(f"label maps of shape {tuple(truth.shape)} hold no pixel")
-    smallest = int(truth.min())
+    known = truth if ignore_label is None else truth[truth.long() != ignore_label]
+    smallest = int(known.min()) if known.numel() else 0
     if smallest < 0:
         raise ValueError(
-            f"truth has the negative label {smallest}; 'ignore' labels are not supported, 0 is the background"
+            f"truth has the negative label {smallest}; labels are >= 0, 0 is the background; set ignore_label="
+            f"{smallest} (scoring.ignore_label={smallest} on the command line) to leave such pixels out"
         )
     smallest = int(prediction.min())
     if smallest < 0:

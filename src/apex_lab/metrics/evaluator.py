@@ -15,9 +15,11 @@ from jaxtyping import Float64, Integer
 
 from apex_lab.metrics.hota import ALPHAS, HotaCounts
 from apex_lab.metrics.identity import IdentityCounts
+from apex_lab.metrics.ignored import ignored_pixels
 from apex_lab.metrics.keys import FRAME_SCORES, VIDEO_SCORES, Number, keys
 from apex_lab.metrics.linking import link_frames
 from apex_lab.metrics.objects import COLUMNS, ObjectMetadata
+from apex_lab.metrics.order import natural_key
 from apex_lab.metrics.tracking import EVENT_TYPES, TrackingCounts
 from apex_lab.metrics.video_record import EvaluatorSettings, VideoRecord, score_video, tracking_values
 
@@ -56,7 +58,7 @@ class Evaluator:
         Args:
             name: unique among the videos.
             prediction: identity of the winning component at every pixel, 0 <= identity <= 2^53.
-            truth: true labels, >= 0; 0 is the background.
+            truth: true labels, >= 0, or `EvaluatorSettings.ignore_label`; 0 is the background.
             metadata: what is known of the true objects, for the results per object.
             background_ids: which identities are the model's background; needed with `drop_background_slot` alone.
 
@@ -68,7 +70,8 @@ class Evaluator:
         if np.max(prediction, initial=0) > MAX_IDENTITY:
             raise ValueError(f"video {name!r} has the identity {np.max(prediction)}; identities end at 2^53")
         if self.settings.identities == "linked":
-            prediction, background_ids = link_frames(prediction), ()
+            prediction = link_frames(prediction, ignored_pixels(truth, self.settings.ignore_label))
+            background_ids = ()
         elif self.settings.tracking.drop_background_slot and background_ids is None:
             raise ValueError(
                 f"drop_background_slot is set, but which identities of video {name!r} are background is not known"
@@ -90,14 +93,14 @@ class Evaluator:
         self.records.update(other.records)
 
     def result(self) -> dict[str, Any]:
-        """Everything, with videos in the order of their names.
+        """Everything, with videos in the natural order of their names (v2 before v10).
 
         Returns:
             `settings`; `versions`; `total` and `per_video` with the keys of `keys.KEYS`; `per_frame`, where wanted;
             `per_object`, a table (`objects.object_rows`); `hota_alpha`, HOTA per threshold; `events`, where wanted,
             a dict per event.
         """
-        records = dict(sorted(self.records.items()))
+        records = {name: self.records[name] for name in sorted(self.records, key=natural_key)}
         per_video = [self._row([record]) for record in records.values()]
         found: dict[str, Any] = {
             "settings": asdict(self.settings),

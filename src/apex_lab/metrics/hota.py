@@ -1,4 +1,4 @@
-"""HOTA, higher order tracking accuracy, of Luiten et al. (IJCV 2021); metrics.md section 4.
+"""HOTA, higher order tracking accuracy, of Luiten et al. (IJCV 2021); metrics.md section 2.2.
 
 At each threshold alpha, detection (DetA: which objects are found) and association (AssA: do found objects keep one
 identity) are measured apart, HOTA_alpha = sqrt(DetA AssA), and HOTA is the mean over alpha = 0.05, 0.10, ..., 0.95.

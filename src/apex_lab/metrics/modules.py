@@ -44,9 +44,10 @@ class SegmentationScore(Metric):
         name: one of `segmentation.SCORES`.
         mode: `frame` and `frame_then_video` differ in who has one vote, frame or video; see `segmentation`.
         skip_empty: leaves frames without any object out of the foreground means.
+        ignore_label: pixels of this true label are left out.
 
     `compute()` is a 0-dim float64 tensor, NaN before any frame counted; `left_out()` says how many frames (videos in
-    the modes `sequence` and `frame_then_video`) `skip_empty` concerned.
+    the modes `sequence` and `frame_then_video`) `skip_empty` concerned, or have no pixel that is not ignored.
     """
 
     full_state_update = False
@@ -55,15 +56,23 @@ class SegmentationScore(Metric):
     sums: Tensor
     counts: Tensor
 
-    def __init__(self, name: str, mode: Mode = "frame", skip_empty: bool = False, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        name: str,
+        mode: Mode = "frame",
+        skip_empty: bool = False,
+        ignore_label: int | None = None,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(**kwargs)
-        self.name, self.mode, self.skip_empty = name, mode, skip_empty
+        self.name, self.mode, self.skip_empty, self.ignore_label = name, mode, skip_empty, ignore_label
         self.add_state("sums", torch.zeros(2, dtype=torch.int64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(2, dtype=torch.int64), dist_reduce_fx="sum")
 
     def update(self, prediction: Labels, truth: Labels) -> None:
         """Adds a batch: identities and true labels, (B, T, H, W) integers >= 0."""
-        values = video_scores(contingency(prediction, truth), self.name, self.mode, self.skip_empty).flatten()
+        table = contingency(prediction, truth, self.ignore_label)
+        values = video_scores(table, self.name, self.mode, self.skip_empty).flatten()
         self.sums += encode_sum(values)
         self.counts += torch.stack([(~values.isnan()).sum(), values.isnan().sum()])
 
@@ -72,7 +81,7 @@ class SegmentationScore(Metric):
         return torch.tensor(decode_mean(self.sums, int(self.counts[0])), dtype=torch.float64, device=self.sums.device)
 
     def left_out(self) -> int:
-        """How many values `skip_empty` left out, by all processes."""
+        """How many values were left out, by all processes."""
         with self.sync_context():
             return int(self.counts[1])
 
@@ -104,6 +113,7 @@ class SceneMetrics(Metric):
     Args:
         names: which of `segmentation.SCORES`.
         skip_empty: leaves frames without any object out of the foreground means.
+        ignore_label: pixels of this true label are left out.
 
     `compute()` has the mean over all frames of all videos per name; keeps one small row per video.
     """
@@ -116,12 +126,18 @@ class SceneMetrics(Metric):
     empty_frames: Tensor
     rows: list[Tensor]
 
-    def __init__(self, names: Sequence[str] = PAPER_SCORES, skip_empty: bool = False, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        names: Sequence[str] = PAPER_SCORES,
+        skip_empty: bool = False,
+        ignore_label: int | None = None,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(**kwargs)
         unknown = [name for name in names if name not in SCORES]
         if unknown:
             raise ValueError(f"there is no segmentation score {unknown[0]!r}; choose from {', '.join(SCORES)}")
-        self.names, self.skip_empty = tuple(names), skip_empty
+        self.names, self.skip_empty, self.ignore_label = tuple(names), skip_empty, ignore_label
         self.add_state("sums", torch.zeros(len(names), 2, dtype=torch.int64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(len(names), dtype=torch.int64), dist_reduce_fx="sum")
         self.add_state("frames", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
@@ -136,7 +152,7 @@ class SceneMetrics(Metric):
             truth: true labels (B, T, H, W), 0 is the background.
             index: number of each video in its data set, for `per_video`; counted up from 0 where missing.
         """
-        table = contingency(prediction, truth)
+        table = contingency(prediction, truth, self.ignore_label)
         values = self._values(table)
         self.sums += encode_sum(values.flatten(1))
         self.counts += (~values.isnan()).flatten(1).sum(dim=1)

@@ -62,6 +62,7 @@ def object_rows(
     boundary: BoundaryScores | None = None,
     frames: Sequence[Detections] = (),
     events: Events | None = None,
+    pixels: int | None = None,
 ) -> pd.DataFrame:
     """One row per true object of one video.
 
@@ -71,6 +72,7 @@ def object_rows(
         metadata: class, occlusion, contact; NaN (class: None) where missing.
         boundary: J and F per object; NaN where missing.
         frames, events: tracking; NaN where missing, which is to say that there are no identities over time.
+        pixels: of an image; as many as the table counts where missing.
 
     Returns:
         columns `label`, `class`, `frames` (in which it is visible), `area_px` (mean where visible), `size` (the same
@@ -85,11 +87,11 @@ def object_rows(
         "label": labels[1:],
         "frames": seen.sum(axis=0),
         "area_px": _mean_where(area, seen),
-        "size": _mean_where(area / counts[0].sum(), seen),
+        "size": _mean_where(area / (pixels or counts[0].sum()), seen),
         "best_iou": _mean_where(best_overlaps(counts), seen),
         "video_iou": best_overlaps(counts.sum(axis=0)) if events else np.nan,
-        "j": boundary.j.mean(axis=1) if boundary else np.nan,
-        "f": boundary.f.mean(axis=1) if boundary else np.nan,
+        "j": np.nanmean(boundary.j, axis=1) if boundary else np.nan,
+        "f": np.nanmean(boundary.f, axis=1) if boundary else np.nan,
     }
     table = pd.DataFrame(
         found | _metadata_columns(labels[1:], seen, metadata) | _tracking_columns(frames, events, labels)

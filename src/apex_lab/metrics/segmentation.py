@@ -37,6 +37,7 @@ def ari(
     foreground: bool = False,
     mode: Mode = "frame",
     skip_empty: bool = False,
+    ignore_label: int | None = None,
 ) -> Float64[Tensor, "..."]:
     """Adjusted Rand index, at most 1, 0 for chance.
 
@@ -46,21 +47,27 @@ def ari(
         foreground: only pixels of objects (ARI-FG); without any such pixel the value is 1.
         mode: see the module.
         skip_empty: foreground only: NaN where no object is visible.
+        ignore_label: pixels of this true label are left out.
 
     Returns:
-        (B, T) in mode `frame`, (B,) otherwise.
+        (B, T) in mode `frame`, (B,) otherwise; NaN where every pixel is left out.
 
     Raises:
         ValueError, TypeError: see `contingency`.
     """
-    return video_scores(contingency(prediction, truth), ari_name(foreground), mode, skip_empty)
+    return video_scores(contingency(prediction, truth, ignore_label), ari_name(foreground), mode, skip_empty)
 
 
 def ari_fg(
-    prediction: Labels, truth: Labels, *, mode: Mode = "frame", skip_empty: bool = False
+    prediction: Labels,
+    truth: Labels,
+    *,
+    mode: Mode = "frame",
+    skip_empty: bool = False,
+    ignore_label: int | None = None,
 ) -> Float64[Tensor, "..."]:
     """`ari` on the pixels of objects."""
-    return ari(prediction, truth, foreground=True, mode=mode, skip_empty=skip_empty)
+    return ari(prediction, truth, foreground=True, mode=mode, skip_empty=skip_empty, ignore_label=ignore_label)
 
 
 def covering(
@@ -71,6 +78,7 @@ def covering(
     scaled: bool = False,
     mode: Mode = "frame",
     skip_empty: bool = False,
+    ignore_label: int | None = None,
 ) -> Float64[Tensor, "..."]:
     """Segmentation covering in [0, 1].
 
@@ -81,14 +89,16 @@ def covering(
         scaled: regions weighted by area (SC) and not one vote each (MSC, the paper's).
         mode: see the module.
         skip_empty: without background only: NaN where no object is visible.
+        ignore_label: pixels of this true label are left out.
 
     Returns:
-        (B, T) in mode `frame`, (B,) otherwise.
+        (B, T) in mode `frame`, (B,) otherwise; NaN where every pixel is left out.
 
     Raises:
         ValueError, TypeError: see `contingency`.
     """
-    return video_scores(contingency(prediction, truth), covering_name(background, scaled), mode, skip_empty)
+    table = contingency(prediction, truth, ignore_label)
+    return video_scores(table, covering_name(background, scaled), mode, skip_empty)
 
 
 SCORES = ("ari", "ari_fg", "msc", "msc_fg", "sc", "sc_fg")
@@ -112,6 +122,8 @@ def video_scores(
         values = best_overlap(counts, background=not foreground, scaled=name.startswith("sc"))
     if foreground and skip_empty:
         values = values.masked_fill(empty, torch.nan)
+    # Where every pixel is ignored there is nothing to score.
+    values = values.masked_fill(counts.sum(dim=(2, 3)) == 0, torch.nan)
     if mode == "frame":
         return values
     return values.squeeze(1) if mode == "sequence" else values.nanmean(dim=1)

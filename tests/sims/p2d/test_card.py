@@ -75,7 +75,7 @@ def test_occlusion_area_and_cut(root: Path, stats: Stats):
             assert stats.occlusion[n, t, part] == pytest.approx(1 - mask.sum() / amodal[n, t, part])
 
 
-def test_page_has_every_part_and_no_hole(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_page_has_every_part_and_no_gap(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["card", str(root), "--out", str(tmp_path)]) == 0
     assert capsys.readouterr().out == f"data card: {tmp_path / 'README.md'}\n"
     text = (tmp_path / "README.md").read_text()
@@ -105,7 +105,7 @@ def test_a_full_disk_is_named_and_leaves_no_page(root: Path, tmp_path: Path, mon
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(draw, "histograms", full)
-    with pytest.raises(SimError, match="make room on that disk"):
+    with pytest.raises(SimError, match="free space on that disk"):
         write_card(root, tmp_path / "card")
     assert not (tmp_path / "card" / "README.md").exists()
 

@@ -1,4 +1,4 @@
-"""`python -m sims.p2d`: settings from words, exit codes, sentences."""
+"""`python -m sims.p2d`: settings from arguments, exit codes, messages."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from tests.fakes.p2d_tools import FAKE, content, make, small, start, words
 
 @pytest.fixture(autouse=True)
 def fake(monkeypatch: pytest.MonkeyPatch) -> None:
-    make, mend = command.generate, command.repair
+    make, repair = command.generate, command.repair
     monkeypatch.setattr(command, "generate", lambda *a, **k: make(*a, simulator=FAKE, shown=False, **k))
-    monkeypatch.setattr(command, "repair", lambda *a, **k: mend(*a, simulator=FAKE, shown=False, **k))
+    monkeypatch.setattr(command, "repair", lambda *a, **k: repair(*a, simulator=FAKE, shown=False, **k))
 
 
 def test_settings_from_words():
@@ -44,11 +44,11 @@ def test_settings_from_words():
         ("min_objects=4", "settings do not fit together: min_objects 4 must not exceed max_objects 3"),
         ("camera.fog=1", "unknown setting 'camera.fog': did you mean camera."),
         ("camera.fov=1", "unknown setting 'camera.fov': did you mean camera.fov_deg?"),
-        ("frames.x=1", "--set frames.x=1: frames has no settings inside"),
+        ("frames.x=1", "--set frames.x=1: frames has no nested settings"),
         ("frames", "--set frames: expected key=value"),
     ],
 )
-def test_wrong_words_are_refused_in_one_sentence(word: str, sentence: str):
+def test_wrong_settings_are_refused_in_one_sentence(word: str, sentence: str):
     with pytest.raises(SettingsError) as caught:
         settings_from([word], Settings())
     assert str(caught.value).startswith(sentence)
@@ -68,16 +68,16 @@ def test_make_verify_repair(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert command.main(["--out", str(root), *words(small()), "--workers", "1", "--no-card"]) == 0
     assert "8 train, 2 val, 2 test trajectories" in capsys.readouterr().out
     assert command.main(["verify", str(root)]) == 0
-    assert "all bytes are right" in capsys.readouterr().out
+    assert "all checksums match" in capsys.readouterr().out
     (root / "val" / "poses.npy").unlink()
     assert command.main(["verify", str(root)]) == 1
     out = capsys.readouterr().out
     assert "val/poses.npy is missing" in out
     assert "trajectory val/0-1: bytes do not match the checksum" in out
     assert command.main(["verify", str(root), "--repair"]) == 0
-    assert capsys.readouterr().out.endswith(f"{root}: mended\n")
+    assert capsys.readouterr().out.endswith(f"{root}: repaired\n")
     assert command.main(["verify", str(root), "--repair"]) == 0
-    assert capsys.readouterr().out == f"{root}: nothing is damaged\n"
+    assert capsys.readouterr().out == f"{root}: no damage found\n"
 
 
 def test_settings_need_not_be_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

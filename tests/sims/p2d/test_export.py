@@ -1,4 +1,4 @@
-"""What is exported reads back, by other people's readers, as exactly what the arrays hold."""
+"""Exports read back, by other libraries, as exactly the stored arrays."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_mot_boxes_are_those_of_the_masks(root: Path, mot: Path):
     for split in ("train", "val"):
         stored = arrays(root, split)
         names = (mot / "seqmaps" / f"P2D-{split}.txt").read_text().split()
-        assert names == ["name", *(f"P2D-{split}-{index:06d}" for index in range(len(stored["rgb"])))]
+        assert names == ["name", *(f"{split}_{index:05d}" for index in range(len(stored["rgb"])))]
         for index, name in enumerate(names[1:]):
             folder = mot / f"P2D-{split}" / name
             table = motmetrics.io.loadtxt(folder / "gt" / "gt.txt", fmt="mot16", min_confidence=1)
@@ -97,7 +97,7 @@ def test_mot_boxes_are_those_of_the_masks(root: Path, mot: Path):
                 for identity in set(np.unique(stored["segmentation"][index, frame])) - {0}:
                     row = table.loc[(frame + 1, identity)]
                     rows, columns = np.nonzero(stored["segmentation"][index, frame] == identity)
-                    # the reader turns positions that begin at 1 into positions that begin at 0
+                    # the reader converts positions from 1-based to 0-based
                     box = (columns.min(), rows.min(), np.ptp(columns) + 1, np.ptp(rows) + 1)
                     assert (row.X, row.Y, row.Width, row.Height) == box
                     seen += 1
@@ -106,7 +106,7 @@ def test_mot_boxes_are_those_of_the_masks(root: Path, mot: Path):
 
 def test_mot_sequences_describe_themselves(root: Path, mot: Path):
     stored = arrays(root, "val")
-    folder = mot / "P2D-val" / "P2D-val-000001"
+    folder = mot / "P2D-val" / "val_00001"
     info = configparser.ConfigParser()
     info.read(folder / "seqinfo.ini")
     sequence = info["Sequence"]
@@ -127,10 +127,10 @@ def test_the_command(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert main(command) == 0
     assert sorted(path.name for path in out.iterdir()) == ["P2D-val", "seqmaps"]
     assert main(command) == 1
-    assert capsys.readouterr().err.splitlines()[-1] == f"{out} exists already: name a folder that does not"
+    assert capsys.readouterr().err.splitlines()[-1] == f"{out} exists already: choose another folder"
 
 
-def test_a_full_disk_leaves_nothing_half_there(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_full_disk_leaves_no_partial_export(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     written: list[Path] = []
 
     def full(path: Path, rgb: np.ndarray) -> None:

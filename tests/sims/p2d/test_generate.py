@@ -1,4 +1,4 @@
-"""Making a folder: the same bytes by any number of workers, in any order, after any kill; clear words otherwise."""
+"""Making a folder: the same bytes by any number of workers, in any order, after any kill; clear errors otherwise."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_same_bytes_after_kills_at_random_moments(tmp_path: Path, rounds: int):
 def test_same_bytes_when_only_workers_are_killed(tmp_path: Path, unbroken: dict[str, bytes]):
     rng = random.Random(1)
     process = start("--out", tmp_path, *words(small()), "--workers", 2, "--no-card", FAKE_SLEEP_S=0.3)
-    for lines in (2, 5, 8):  # between kills a trajectory was finished, so no one is killed over and over
+    for lines in (2, 5, 8):  # between kills a trajectory was finished, so no trajectory reaches the limit of attempts
         _wait_for_lines(tmp_path / JOURNAL, lines, process)
         time.sleep(rng.uniform(0, 0.2))
         os.kill(rng.choice(children(process.pid)), signal.SIGKILL)
@@ -86,7 +86,7 @@ def test_same_bytes_when_only_workers_are_killed(tmp_path: Path, unbroken: dict[
     assert content(tmp_path) == unbroken
 
 
-def test_a_trajectory_whose_worker_died_is_made_again(
+def test_a_trajectory_whose_worker_died_is_retried(
     tmp_path: Path, unbroken: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ):
     marks = tmp_path / "marks"
@@ -103,24 +103,24 @@ def test_a_trajectory_that_always_kills_its_worker_ends_with_an_error(tmp_path: 
         make(tmp_path, workers=2)
 
 
-def test_what_an_exception_in_a_worker_said_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_exception_in_a_worker_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("FAKE_RAISE", "val-1")
     with pytest.raises(SimError, match=r"val/1 \(exit code 1\): RuntimeError: the fake fell over"):
         make(tmp_path)
 
 
-def test_what_the_simulator_refuses_is_told_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_an_error_of_the_simulator_is_reported_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("FAKE_REFUSE", "train-0")
     with pytest.raises(SimError, match=r"^the fake does not like this one$"):
         make(tmp_path)
 
 
-def test_a_missing_simulator_is_told(tmp_path: Path):
+def test_a_missing_simulator_is_reported(tmp_path: Path):
     with pytest.raises(SimError, match="package 'no_such_engine' is not installed"):
         generate(tmp_path, small(), simulator="no_such_engine", workers=1)
 
 
-def test_an_error_leaves_what_is_made_and_the_next_start_makes_only_the_rest(
+def test_after_an_error_the_next_start_generates_only_the_rest(
     tmp_path: Path, unbroken: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ):
     log = tmp_path / "log"
@@ -129,7 +129,7 @@ def test_an_error_leaves_what_is_made_and_the_next_start_makes_only_the_rest(
         patch.setenv("FAKE_REFUSE", "train-6")
         with pytest.raises(SimError):
             make(tmp_path / "data")
-    with pytest.raises(SimError, match=r"is not finished \(6 of 12 trajectories made\): go on with python -m sims.p2d"):
+    with pytest.raises(SimError, match=r"is not finished \(6 of 12 trajectories made\): resume with python -m"):
         read_manifest(tmp_path / "data")
     monkeypatch.setenv("FAKE_LOG", str(log))
     make(tmp_path / "data")
@@ -137,7 +137,7 @@ def test_an_error_leaves_what_is_made_and_the_next_start_makes_only_the_rest(
     assert content(tmp_path / "data") == unbroken
 
 
-def test_half_written_records_and_data_are_made_again(
+def test_half_written_records_and_data_are_generated_again(
     tmp_path: Path, unbroken: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
 ):
     with monkeypatch.context() as patch:
@@ -145,7 +145,7 @@ def test_half_written_records_and_data_are_made_again(
         with pytest.raises(SimError):
             make(tmp_path)
     journal = tmp_path / JOURNAL
-    journal.write_bytes(journal.read_bytes()[:-20])  # the last line torn
+    journal.write_bytes(journal.read_bytes()[:-20])  # a partial last line
     with open(tmp_path / "train" / "rgb.npy", "r+b") as file:  # power cut: a recorded trajectory never reached the disk
         file.seek(128 + 2 * 3 * 16 * 16 * 3)
         file.write(bytes(100))
@@ -173,12 +173,12 @@ def test_a_lost_manifest_is_written_again_without_simulating(
 
 def test_other_settings_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     make(tmp_path / "whole")
-    with pytest.raises(SimError, match=r"holds other data than wished \(seed is 0 there and 1 here\)"):
+    with pytest.raises(SimError, match=r"holds data with other settings \(seed is 0 there and 1 here\)"):
         make(tmp_path / "whole", small(seed=1))
     monkeypatch.setenv("FAKE_REFUSE", "train-6")
     with pytest.raises(SimError):
         make(tmp_path / "part")
-    with pytest.raises(SimError, match=r"was begun with other settings \(frames is 3 there and 4 here\)"):
+    with pytest.raises(SimError, match=r"was started with other settings \(frames is 3 there and 4 here\)"):
         make(tmp_path / "part", small(frames=4))
 
 
@@ -188,20 +188,20 @@ def test_other_versions_do_not_mix(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         with pytest.raises(SimError):
             make(tmp_path)
     monkeypatch.setenv("FAKE_VERSION", "2")
-    with pytest.raises(SimError, match="was begun with fake 1 and here is fake 2"):
+    with pytest.raises(SimError, match="was started with fake 1 and here is fake 2"):
         make(tmp_path)
 
 
-def test_a_folder_with_something_else_is_left_alone(tmp_path: Path):
+def test_a_folder_with_other_content_is_left_alone(tmp_path: Path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(SimError, match=r"holds something that is not P2D \(thesis.tex\)"):
+    with pytest.raises(SimError, match=r"contains files that are not P2D \(thesis.tex\)"):
         make(tmp_path)
     with pytest.raises(SimError, match="cannot be used as a folder"):
         make(tmp_path / "thesis.tex")
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def test_two_at_once_make_every_trajectory_once(tmp_path: Path, unbroken: dict[str, bytes]):
+def test_two_processes_generate_every_trajectory_once(tmp_path: Path, unbroken: dict[str, bytes]):
     log = tmp_path / "log"
     log.mkdir()
     both = [
@@ -216,7 +216,7 @@ def test_two_at_once_make_every_trajectory_once(tmp_path: Path, unbroken: dict[s
 
 
 @linux
-def test_ctrl_c_ends_cleanly_and_the_same_command_goes_on(tmp_path: Path, unbroken: dict[str, bytes]):
+def test_ctrl_c_ends_cleanly_and_the_same_command_resumes(tmp_path: Path, unbroken: dict[str, bytes]):
     command = ("--out", tmp_path, *words(small()), "--workers", 2, "--no-card")
     process = start(*command, FAKE_SLEEP_S=0.3)
     _wait_for_lines(tmp_path / JOURNAL, 3, process)
@@ -225,7 +225,7 @@ def test_ctrl_c_ends_cleanly_and_the_same_command_goes_on(tmp_path: Path, unbrok
     _, text = process.communicate(timeout=120)
     assert process.returncode == 130
     assert "Traceback" not in text
-    assert "the same command goes on" in text
+    assert "run the same command to resume" in text
     assert workers
     _wait_until_gone(workers)
     again = start(*command)
@@ -244,7 +244,7 @@ def test_workers_do_not_outlive_a_killed_parent(tmp_path: Path):
     _wait_until_gone(workers)
 
 
-def test_too_little_room_is_found_before_the_start(tmp_path: Path):
+def test_too_little_space_is_found_before_the_start(tmp_path: Path):
     huge = small(train=10_000_000, frames=1000, image_size=1024)
     with pytest.raises(SimError, match=r"P2D needs \d+.\d+ GB more at .* but only \d+.\d+ (GB|MB) are free there"):
         make(tmp_path, huge)
@@ -264,12 +264,12 @@ except SimError as error:
 """
 
 
-def test_a_file_that_cannot_grow_is_told_and_nothing_useless_stays(tmp_path: Path):
+def test_a_file_that_cannot_grow_is_reported_and_leaves_nothing(tmp_path: Path):
     done = subprocess.run(
         [sys.executable, "-c", LIMITED, str(tmp_path)], cwd=REPOSITORY, capture_output=True, text=True, check=False
     )
     assert done.returncode == 1
-    assert done.stderr.startswith(f"writing {tmp_path}/train/rgb.npy failed (File too large): make room on that disk")
+    assert done.stderr.startswith(f"writing {tmp_path}/train/rgb.npy failed (File too large): free space on that disk")
     assert not list(tmp_path.glob("*/*.npy"))
 
 
@@ -288,17 +288,17 @@ def small_disk(tmp_path: Path):
     subprocess.run(["umount", "-l", str(folder)], check=True)
 
 
-def test_a_disk_that_others_fill_stops_the_work_and_keeps_what_is_made(
+def test_a_disk_filled_by_others_stops_the_work_and_keeps_finished_trajectories(
     small_disk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     settings = small(train=60)
     make(tmp_path / "unbroken", settings)
     root = small_disk / "data"
     with monkeypatch.context() as patch:
-        # Without reserved room, as on file systems that cannot reserve.
+        # Without reserved space, as on file systems that cannot reserve.
         patch.delattr(os, "posix_fallocate")
         patch.setenv("FAKE_FILL", str(small_disk))
-        with pytest.raises(SimError, match=r"failed \(No space left on device\): make room on that disk and give the"):
+        with pytest.raises(SimError, match=r"failed \(No space left on device\): free space on that disk and run the"):
             make(root, settings)
     made = len((root / JOURNAL).read_bytes().splitlines()) - 1
     assert 0 < made < len(keys(settings))
@@ -307,7 +307,7 @@ def test_a_disk_that_others_fill_stops_the_work_and_keeps_what_is_made(
     assert content(root) == content(tmp_path / "unbroken")
 
 
-def test_reserved_room_lasts_when_others_fill_the_disk(small_disk: Path, monkeypatch: pytest.MonkeyPatch):
+def test_reserved_space_lasts_when_others_fill_the_disk(small_disk: Path, monkeypatch: pytest.MonkeyPatch):
     root = small_disk / "data"
     monkeypatch.setenv("FAKE_FILL", str(small_disk))
     with pytest.raises(SimError, match="No space left on device"):  # for the small files at the end, not for the data

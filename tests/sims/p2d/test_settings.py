@@ -1,4 +1,4 @@
-"""Settings refuse what no data set can be."""
+"""Impossible settings are refused."""
 
 from __future__ import annotations
 

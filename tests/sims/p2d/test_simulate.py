@@ -1,4 +1,4 @@
-"""Whole trajectories: the same bytes always, exact labels, believable motion."""
+"""Whole trajectories: reproducible bytes, exact labels, plausible motion."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_stored_poses_and_camera_put_objects_where_their_masks_are(trajectories:
     assert checked > 5
 
 
-def test_motion_is_believable(trajectories: dict[int, Trajectory]) -> None:
+def test_motion_is_plausible(trajectories: dict[int, Trajectory]) -> None:
     models = object_models(SETTINGS.objects)
     for index, trajectory in trajectories.items():
         spec = sample(SETTINGS, "train", index, trajectory.redraws)

@@ -1,4 +1,4 @@
-"""What is drawn for a trajectory, before any physics."""
+"""The sampled specification of a trajectory, before any physics."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_the_same_key_gives_the_same_spec_and_others_do_not() -> None:
     assert again.aimed == spec.aimed
 
 
-def test_how_many_are_drawn_does_not_matter_to_settings_of_the_splits() -> None:
+def test_a_trajectory_does_not_depend_on_the_sizes_of_the_splits() -> None:
     """Trajectory i is the same in a small and in a large data set."""
     assert sample(Settings(train=5, frames=4), "train", 2) == sample(SETTINGS, "train", 2)
 

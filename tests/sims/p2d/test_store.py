@@ -91,7 +91,7 @@ def test_fingerprint_changes_with_every_setting():
     assert len(found) == len(changes) + 1
 
 
-def test_manifest_says_all_and_reads_back(tmp_path: Path):
+def test_manifest_is_complete_and_reads_back(tmp_path: Path):
     made = make(tmp_path)
     read = read_manifest(tmp_path)
     assert read == made
@@ -103,7 +103,7 @@ def test_manifest_says_all_and_reads_back(tmp_path: Path):
     ]
 
 
-def test_content_tells_data_of_different_bytes_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_content_differs_for_different_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     first = make(tmp_path / "a")
     monkeypatch.setenv("FAKE_OTHER_BYTES", "1")
     second = make(tmp_path / "b")

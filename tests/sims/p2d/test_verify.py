@@ -1,4 +1,4 @@
-"""Damage of every kind is found, named and mended, and nothing but the damaged is made again."""
+"""Damage of every kind is found, named and repaired; only damaged trajectories are generated again."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def flip(path: Path, position: int) -> None:
     path.write_bytes(data)
 
 
-def mend(root: Path, log: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def repaired(root: Path, log: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Repairs; returns which trajectories were simulated, as split-index."""
     log.mkdir()
     monkeypatch.setenv("FAKE_LOG", str(log))
@@ -48,7 +48,7 @@ def mend(root: Path, log: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return sorted("-".join(path.name.split("-")[:2]) for path in log.iterdir())
 
 
-def test_good_data_are_good(root: Path):
+def test_undamaged_data_pass(root: Path):
     assert check(root, small()) == read_manifest(root)
     damage = verify(root, read_manifest(root), shown=False)
     assert not damage
@@ -63,17 +63,17 @@ def test_a_flipped_bit_in_any_array_is_found(root: Path, name: str):
     assert damage.lines() == ["trajectory train/7: bytes do not match the checksum"]
 
 
-def test_flipped_bits_are_mended_by_making_only_those_trajectories_again(
+def test_only_trajectories_with_flipped_bits_are_generated_again(
     root: Path, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     flip(root / "train" / "rgb.npy", -1)
     flip(root / "val" / "redraws.npy", 128)
-    assert mend(root, tmp_path / "log", monkeypatch) == ["train-7", "val-0"]
+    assert repaired(root, tmp_path / "log", monkeypatch) == ["train-7", "val-0"]
     assert content(root) == content(made)
     assert not verify(root, read_manifest(root), shown=False)
 
 
-def test_many_damaged_trajectories_are_named_in_runs(root: Path):
+def test_many_damaged_trajectories_are_named_as_ranges(root: Path):
     for index in (0, 2, 3, 4, 7):
         flip(root / "train" / "segmentation.npy", 128 + index * 3 * 16 * 16)
     flip(root / "val" / "joints.npy", -1)
@@ -108,7 +108,7 @@ DAMAGES = [
 
 
 @pytest.mark.parametrize(("damage", "sentence", "again"), DAMAGES, ids=[case[0].__name__ for case in DAMAGES])
-def test_damaged_files_are_found_at_every_start_named_and_mended(
+def test_damaged_files_are_found_at_every_start_and_repaired(
     root: Path,
     made: Path,
     tmp_path: Path,
@@ -120,23 +120,23 @@ def test_damaged_files_are_found_at_every_start_named_and_mended(
     damage(root)
     with pytest.raises(SimError) as caught:
         check(root)
-    assert str(caught.value) == f"{root}/{sentence}: mend it with python -m sims.p2d verify {root} --repair"
-    with pytest.raises(SimError, match="mend it with"):
+    assert str(caught.value) == f"{root}/{sentence}: repair it with python -m sims.p2d verify {root} --repair"
+    with pytest.raises(SimError, match="repair it with"):
         generate(root, small(), simulator=FAKE)
     found = verify(root, read_manifest(root), shown=False)
     assert found.files == [f"{root}/{sentence}"]
-    assert mend(root, tmp_path / "log", monkeypatch) == again
+    assert repaired(root, tmp_path / "log", monkeypatch) == again
     assert content(root) == content(made)
 
 
 @pytest.mark.parametrize("position", [5, 300, -40])
-def test_a_damaged_manifest_is_found_and_mended_from_the_journal(
+def test_a_damaged_manifest_is_found_and_repaired_from_the_journal(
     root: Path, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, position: int
 ):
     flip(root / MANIFEST, position)
-    with pytest.raises(SimError, match=r"manifest.json is damaged: mend it with"):
+    with pytest.raises(SimError, match=r"manifest.json is damaged: repair it with"):
         check(root)
-    assert mend(root, tmp_path / "log", monkeypatch) == []
+    assert repaired(root, tmp_path / "log", monkeypatch) == []
     assert content(root) == content(made)
 
 
@@ -164,7 +164,7 @@ def test_another_format_is_refused(root: Path):
     (root / MANIFEST).write_text(json.dumps({**data, "format": 7}))
     for command in (check, lambda path: repair(path, simulator=FAKE)):
         with pytest.raises(
-            SimError, match="was written in format 7 and this program reads format 1: make the data anew"
+            SimError, match="was written in format 7 and this program reads format 1: generate the data again"
         ):
             command(root)
 
@@ -181,12 +181,12 @@ def test_settings_of_a_later_version_are_refused(root: Path):
         check(root)
 
 
-def test_other_wishes_are_told_by_key(root: Path):
+def test_differing_settings_are_named_by_key(root: Path):
     with pytest.raises(SimError, match="image_size is 16 there and 32 here"):
         check(root, small(image_size=32))
 
 
-def test_missing_and_unfinished_folders_are_told(tmp_path: Path):
+def test_missing_and_unfinished_folders_are_reported(tmp_path: Path):
     with pytest.raises(SimError, match=f"no P2D data at {tmp_path}/none: make them with python -m sims.p2d --out"):
         check(tmp_path / "none")
     with pytest.raises(SimError, match="no P2D data at"):
@@ -219,7 +219,7 @@ def test_a_killed_repair_can_be_started_again(root: Path, made: Path):
     again = start("verify", root, "--repair", "--workers", 1)
     text, _ = again.communicate(timeout=120)
     assert again.returncode == 0
-    assert f"{root}: mended" in text
+    assert f"{root}: repaired" in text
     assert content(root) == content(made)
 
 
@@ -234,7 +234,7 @@ def test_a_fresh_folder_counts_as_checked(made: Path):
     assert is_verified(made, read_manifest(made))
 
 
-def test_any_touch_calls_for_a_full_check_even_with_its_time_put_back(root: Path):
+def test_any_change_needs_a_full_check_even_with_its_time_reset(root: Path):
     manifest = read_manifest(root)
     verify(root, manifest, shown=False)
     path = root / "test" / "segmentation.npy"
@@ -249,14 +249,16 @@ def test_any_touch_calls_for_a_full_check_even_with_its_time_put_back(root: Path
     assert not is_verified(root, manifest)
 
 
-def test_a_damaged_note_of_the_last_check_is_no_note(root: Path):
+def test_a_damaged_record_of_the_last_check_is_ignored(root: Path):
     verify(root, read_manifest(root), shown=False)
     (root / VERIFIED).write_text("{")
     assert not is_verified(root, read_manifest(root))
 
 
-def test_manifest_and_journal_both_damaged_is_told(root: Path):
+def test_manifest_and_journal_both_damaged_is_reported(root: Path):
     flip(root / MANIFEST, 5)
     (root / JOURNAL).unlink()
-    with pytest.raises(SimError, match=r"is damaged and trajectories\.jsonl is missing: make the data anew"):
+    with pytest.raises(
+        SimError, match=r"is damaged and trajectories\.jsonl is missing: delete the folder and generate"
+    ):
         repair(root, simulator=FAKE)

@@ -21,7 +21,7 @@ Eq. 18  objects.py     `context_probability`   its p_context
 Eq. 19  model.py       `_explain`              ELBO: the likelihood term
 Eq. 20  objective.py   `kl_terms`              ELBO: the KL terms
 Eq. 21  objective.py   `mask_entropy`          mask entropy loss
-Eq. 22  model.py       `_explain`              full objective: `Learner.loss` weighs (conf/model/apex.yaml) and sums
+Eq. 22  model.py       `_explain`              full objective: `WeightUpdate.objective` (conf/recipe/apex)
 """
 
 from apex_lab.models.apex.background import Background

@@ -1,0 +1,168 @@
+"""OP3 as a whole: agreement with the naive twin, and the contract of models."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from apex_lab.models.op3 import Op3
+from apex_lab.nn.noise import VideoNoise
+from apex_lab.scene import Context, Scene
+from tests.reference.op3 import NaiveOp3
+
+SIZE = 16
+
+
+@pytest.fixture
+def model() -> Op3:
+    torch.manual_seed(0)
+    return Op3(image_size=SIZE, slots=3, stochastic=8, deterministic=4, hidden=16)
+
+
+@pytest.fixture
+def video() -> Tensor:
+    return torch.rand(2, 4, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
+
+
+def context(first_frame: int = 0, videos: tuple[int, ...] = (5, 6), **fields: object) -> Context:
+    return Context(noise=VideoNoise(0, videos, first_frame), **fields)  # type: ignore[arg-type]
+
+
+def loss(scene: Scene) -> Tensor:
+    return (scene.terms["nll"] + 0.01 * scene.terms["kl"]).mean()
+
+
+def gradients(model: Op3) -> dict[str, Tensor]:
+    found = {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
+    model.zero_grad()
+    return found
+
+
+@pytest.mark.parametrize("weighting", ["segment", "linear"])
+@pytest.mark.parametrize(("first", "later"), [(2, 1), (1, 2), (2, 0)])
+def test_the_naive_twin_agrees(weighting: str, first: int, later: int, video: Tensor) -> None:
+    torch.manual_seed(0)
+    model = Op3(SIZE, 3, 8, 4, 16, 0.1, 0.05, first, later, weighting, loss_batch=7)  # type: ignore[arg-type]
+    scene, twin = model(video, context()), NaiveOp3(model)(video, VideoNoise(0, (5, 6)))
+    for name in Op3.term_names:
+        torch.testing.assert_close(scene.terms[name], twin.terms[name], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(scene.masks, twin.masks, rtol=1e-4, atol=1e-5)
+    total = (scene.terms["nll"] + model.beta * scene.terms["kl"]).mean()
+    torch.testing.assert_close(total, twin.total, rtol=1e-5, atol=0)
+    total.backward()
+    found = gradients(model)
+    twin.total.backward()
+    wanted = gradients(model)
+    assert found.keys() == wanted.keys()
+    largest = max(float(g.abs().max()) for g in wanted.values())
+    for name, gradient in wanted.items():
+        # the scales of the norms have gradients that nearly cancel
+        assert float((found[name] - gradient).abs().max()) <= 2e-3 * float(gradient.abs().max()) + 1e-6 * largest, name
+
+
+def test_evaluation_is_the_same_computation_without_a_graph(model: Op3, video: Tensor) -> None:
+    trained = model(video, context())
+    evaluated = model.eval()(video, context())
+    assert trained.masks.requires_grad
+    assert not evaluated.masks.requires_grad
+    torch.testing.assert_close(evaluated.masks, trained.masks.detach())
+    with torch.no_grad():
+        torch.testing.assert_close(model.train()(video, context()).masks, evaluated.masks)
+
+
+def test_scene(model: Op3, video: Tensor) -> None:
+    scene = model.eval()(video, context(detail=True))
+    torch.testing.assert_close(scene.masks.sum(2), torch.ones(2, 4, SIZE, SIZE))
+    assert not scene.background.any()
+    assert scene.ids.tolist() == [[[0, 1, 2]] * 4] * 2
+    assert (scene.presence == 1).all()
+    assert scene.appearance.shape == (2, 4, 3, 12)
+    assert scene.windows is None
+    assert scene.means is not None
+    assert scene.means.shape == (2, 4, 3, 3, SIZE, SIZE)
+    for image in (scene.means, scene.reconstruction):
+        assert 0 <= float(image.min()) <= float(image.max()) <= 1
+    assert scene.terms.keys() == set(Op3.term_names)
+    assert model(video, context()).means is None
+    assert scene.diagnostics.keys() == {"nll_predicted", "nll_refined"}
+    assert model(video[:, :1], context()).diagnostics.keys() == {"nll_refined"}
+
+
+@pytest.mark.parametrize("cut", [1, 2, 3])
+def test_chunks_give_what_the_whole_gives(model: Op3, video: Tensor, cut: int) -> None:
+    model.eval()
+    whole = model(video, context())
+    first = model(video[:, :cut], context())
+    second = model(video[:, cut:], context(cut, state=first.state))
+    torch.testing.assert_close(torch.cat([first.masks, second.masks], 1), whole.masks)
+    torch.testing.assert_close(torch.cat([first.appearance, second.appearance], 1), whole.appearance)
+    # terms are weighted means over steps: those of the chunks by the sums of their weights
+    before, after = (sum(s.weight for s in model.plan.steps(n, b)) for n, b in ((cut, 0), (4 - cut, cut)))
+    for name, term in whole.terms.items():
+        chunks = (first.terms[name] * before + second.terms[name] * after) / (before + after)
+        torch.testing.assert_close(chunks, term)
+    assert second.state.frames == 4
+    torch.testing.assert_close(second.state.sample, whole.state.sample)
+
+
+def test_a_video_does_not_depend_on_its_company(model: Op3, video: Tensor) -> None:
+    together = model(video, context())
+    alone = model(video[1:], context(videos=(6,)))
+    torch.testing.assert_close(together.masks[1:], alone.masks, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(together.terms["nll"][1:], alone.terms["nll"], rtol=1e-4, atol=1e-3)
+
+
+def test_evaluation_repeats_and_depends_on_the_noise(model: Op3, video: Tensor) -> None:
+    model.eval()
+    first = model(video, context())
+    assert torch.equal(first.masks, model(video, context()).masks)
+    assert not torch.equal(first.masks, model(video, context(videos=(7, 8))).masks)
+
+
+def test_noise_alone_tells_slots_apart(model: Op3, video: Tensor) -> None:
+    class Silent(VideoNoise):
+        def normal(self, like: Tensor) -> Tensor:
+            return torch.zeros_like(like)
+
+        def at(self, frame: int, frames: int = 1) -> VideoNoise:
+            return self
+
+    masks = model.eval()(video, Context(noise=Silent(0, (5, 6)))).masks
+    torch.testing.assert_close(masks, torch.full_like(masks, 1 / 3))
+
+
+def test_gradients_reach_all_parameters(model: Op3, video: Tensor) -> None:
+    loss(model(video, context())).backward()
+    for name, parameter in model.named_parameters():
+        assert parameter.grad is not None, name
+        assert parameter.grad.isfinite().all(), name
+        if name != "refinement.norm_others.shift":  # rounds to zero at the start
+            assert parameter.grad.any(), name
+
+
+def test_one_frame_leaves_the_dynamics_alone(model: Op3, video: Tensor) -> None:
+    loss(model(video[:, :1], context())).backward()
+    assert all(parameter.grad is None for parameter in model.dynamics.parameters())
+
+
+def test_bfloat16_runs(model: Op3, video: Tensor) -> None:
+    with torch.autocast("cpu", torch.bfloat16):
+        scene = model(video, context())
+        loss(scene).backward()
+        evaluated = model.eval()(video, context())
+    assert scene.masks.dtype == evaluated.masks.dtype == torch.float32
+    assert scene.terms["nll"].dtype == torch.float32
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
+    torch.testing.assert_close(scene.masks[:, 0], model(video, context()).masks[:, 0], atol=0.1, rtol=0)
+
+
+def test_other_image_sizes_are_refused(model: Op3) -> None:
+    assert Op3.input_size is None
+    assert model.input_size == (SIZE, SIZE)
+    with pytest.raises(ValueError, match=r"built for images of \(16, 16\) px, the video has \(8, 8\)"):
+        model(torch.rand(2, 1, 3, 8, 8), context())
+
+
+def test_state_dict_holds_parameters_alone(model: Op3) -> None:
+    assert set(model.state_dict()) == {name for name, _ in model.named_parameters()}
