@@ -151,15 +151,8 @@ def test_without_the_simulator_one_sentence_says_so(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(
         code, "generate", lambda root, settings, workers: generate(root, settings, simulator="pybullet_is_not_here")
     )
-<<<<<<< HEAD:tests/data/test_p2d_source.py
-    with pytest.raises(
-        UserError, match=r"pybullet_is_not_here' is not installed \(pybullet has wheels up to Python 3.11"
-    ):
-        source(tmp_path).prepare()
-=======
     with pytest.raises(UserError, match=r"pybullet_is_not_here' is not installed: install it \(for pybullet, run"):
-        module(tmp_path).prepare_data()
->>>>>>> main:tests/data/test_module.py
+        source(tmp_path).prepare()
 
 
 def flip(data: P2DSource) -> None:
