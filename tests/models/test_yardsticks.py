@@ -231,8 +231,7 @@ def test_color_clusters_weigh_hue_above_lightness() -> None:
     video[..., 24:, :] = 0.35  # the lower half in shadow
     video[..., 10:20, 10:20] = torch.tensor([0.6, 0.45, 0.45])[:, None, None]
     plain, weighted = (
-        ColorClusters(colors=2, lightness=weight)(video, Context(detail=True)).segmentation()[0, 0]
-        for weight in (1.0, 0.1)
+        ColorClusters(colors=2, lightness=weight)(video, Context()).segmentation()[0, 0] for weight in (1.0, 0.1)
     )
     assert plain[40, 5] != plain[5, 5]
     assert plain[15, 15] == plain[5, 5]

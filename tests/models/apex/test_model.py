@@ -175,7 +175,7 @@ def test_z_what_zero_gives_discovery_and_propagation_the_same_appearance() -> No
     """Discovery infers z_what with the same networks as propagation, from z_what_0 = 0."""
     model = tiny().eval()
     e = torch.randn(1, 1, 8, 8, 8)
-    proposals = model.discovery(e, e, model.glimpses, model.appearance, False)
+    proposals = model.discovery(e, e, model.glimpses, model.appearance, None)
     code = model.glimpses.look(e[:, 0], window_of(proposals.place[:, 0])).flatten(0, 1)
     q, _ = model.appearance(code, torch.zeros(16, 6), torch.zeros(16, 12))
     torch.testing.assert_close(proposals.q_what.mean[0, 0], q.mean)
