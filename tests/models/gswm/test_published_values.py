@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from apex_lab.schedules import Exponential, Linear
 from torch import Tensor, nn
 
 from apex_lab.models.gswm import Background, Gswm, ImageEncoder, Motion
@@ -24,7 +23,7 @@ from apex_lab.models.gswm.history import History
 from apex_lab.models.gswm.latents import kl_bernoulli
 from apex_lab.models.gswm.slots import keep
 from apex_lab.nn.spatial_transformer import crop, paste
-from apex_lab.training_schedules_gswm import Staircase
+from apex_lab.training.schedules import Exponential, Linear, Staircase
 
 PUBLISHED = dict(np.load(Path(__file__).parent / "fixtures" / "published.npz"))
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from apex_lab.models.gswm.latents import precise
 from apex_lab.models.gswm.networks import norm
 from apex_lab.nn.layout import for_convolutions
-from apex_lab.nn.parts import joined, part_size
+from apex_lab.nn.splitting import joined, part_size
 
 Count = Annotated[int, Field(gt=0)]
 Norm = Literal["frame", "clip", "group"]

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from apex_lab.nn.layout import for_convolutions
-from apex_lab.nn.parts import joined, part_size
+from apex_lab.nn.splitting import joined, part_size
 
 PER_GROUP = 16
 """Channels of a group in every GroupNorm of the published model."""

@@ -14,8 +14,8 @@ from torch.autograd.function import once_differentiable
 from apex_lab.models.gswm.boxes import paste_window
 from apex_lab.models.gswm.latents import Attributes, precise
 from apex_lab.models.gswm.networks import Decoder
-from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import Paster
+from apex_lab.nn.splitting import joined, part_size
 
 IMPORTANCE_GUARD = 1e-5
 

@@ -14,6 +14,7 @@ from apex_lab.models.space.latents import split_gaussian
 from apex_lab.models.space.likelihood import GUARD
 from apex_lab.models.space.networks import StridedEncoder, mask_decoder, strong_decoder
 from apex_lab.nn.distributions import Gaussian, kl_gaussian
+from apex_lab.nn.precision import full
 from apex_lab.scene import Noise
 
 FLOOR = 1e-4
@@ -93,7 +94,7 @@ class Background(nn.Module):
 
     def forward(self, images: Float[Tensor, "n 3 H W"], noise: Noise) -> tuple[Layers, dict[str, Float[Tensor, " n"]]]:
         """RGB in [0, 1] -> the background's components and their KL terms."""
-        z_mask, q_mask = self._infer_masks(F.elu(self.image_encoder(images)).float(), noise)
+        z_mask, q_mask = self._infer_masks(full(F.elu(self.image_encoder(images))), noise)
         kl_mask = kl_gaussian(q_mask, self._mask_prior(z_mask))
         masks = self._masks(z_mask)
         log_masks = (masks + GUARD).log()[:, :, None]
@@ -102,7 +103,7 @@ class Background(nn.Module):
         q_component = split_gaussian(code, FLOOR)
         kl_component = kl_gaussian(q_component, split_gaussian(self.component_prior(z_mask), FLOOR))
         z_component = q_component.sample(noise)
-        means = self.component_decoder(z_component.flatten(0, 1)).float().unflatten(0, (-1, self.components))
+        means = full(self.component_decoder(z_component.flatten(0, 1))).unflatten(0, (-1, self.components))
         return Layers(masks, means, z_component), {"kl_mask": kl_mask.sum(1), "kl_component": kl_component.sum(1)}
 
     def _infer_masks(
@@ -135,7 +136,7 @@ class Background(nn.Module):
         """Masks pi; the last component's z_m is not decoded, since it takes what is left."""
         if self.components == 1:
             return z.new_ones(len(z), 1, self.image_size, self.image_size)
-        taken = self.mask_decoder(z[:, :-1].flatten(0, 1)).float()
+        taken = full(self.mask_decoder(z[:, :-1].flatten(0, 1)))
         return stick_breaking(taken.squeeze(1).unflatten(0, (len(z), -1)))
 
 

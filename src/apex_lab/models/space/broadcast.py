@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from apex_lab.models.space.networks import conv_elu, cpu_layout
+from apex_lab.nn.precision import full
 
 
 class BroadcastDecoder(nn.Module):
@@ -52,7 +53,7 @@ class BroadcastDecoder(nn.Module):
         y, x = torch.meshgrid(self.axis, self.axis, indexing="ij")
         with torch.autocast(latent.device.type, enabled=False):
             weight = conv.weight
-            by_latent = F.linear(latent.float(), weight[:, :length].sum((2, 3)), conv.bias)
+            by_latent = F.linear(full(latent), weight[:, :length].sum((2, 3)), conv.bias)
             by_place = F.conv2d(torch.stack([x, y])[None], weight[:, length:])
             if norm.training:
                 mean = by_latent.mean(0) + by_place.mean((0, 2, 3))

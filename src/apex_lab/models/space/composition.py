@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from apex_lab.nn.precision import full
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.nn.splitting import part_size
 
@@ -142,7 +143,7 @@ def compose(
         paster: of the cells' windows.
     """
     with torch.autocast(mask.device.type, enabled=False):
-        mask, colour = mask.float(), colour.float()
+        mask, colour = full(mask), full(colour)
         glimpses = torch.cat([mask, mask * colour], dim=2)
         strength = IMPORTANCE * torch.sigmoid(-depth)
         total, shares = _Compose.apply(glimpses, strength, paster.w_y, paster.w_x)

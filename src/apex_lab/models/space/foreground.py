@@ -26,6 +26,7 @@ from apex_lab.models.space.latents import (
 )
 from apex_lab.models.space.networks import GlimpseDecoder, GlimpseEncoder, ImageEncoder
 from apex_lab.nn.distributions import Gaussian, kl_gaussian, standard_normal
+from apex_lab.nn.precision import full
 from apex_lab.nn.spatial_transformer import Paster, crop
 from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import Noise, Schedule
@@ -75,7 +76,7 @@ class Foreground(nn.Module):
         logit, depth, scale, shift = (
             head(features).flatten(2).transpose(1, 2) for head in (self.presence, self.depth, self.scale, self.shift)
         )
-        logit = BOUND * torch.tanh(logit.float().squeeze(-1))
+        logit = BOUND * torch.tanh(full(logit).squeeze(-1))
         q_depth, q_scale, q_shift = split_gaussian(depth), split_gaussian(scale, 1e-15), split_gaussian(shift)
         presence = relaxed_presence(logit, schedule["temperature"], noise)
         z_depth = q_depth.sample(noise)
@@ -110,7 +111,7 @@ class Foreground(nn.Module):
         """Decodes all cells and composes the foreground."""
         n, count = cells.presence.shape
         mask, colour = self.glimpse_decoder(cells.what.flatten(0, 1))
-        mask, colour = mask.float().unflatten(0, (n, count)), colour.float().unflatten(0, (n, count))
+        mask, colour = full(mask).unflatten(0, (n, count)), full(colour).unflatten(0, (n, count))
         paster = self._paster(cells, self.glimpse_size)
         masked = mask * cells.presence[..., None, None, None]
         return Drawn(compose(masked, colour, cells.depth, paster), colour, paster)

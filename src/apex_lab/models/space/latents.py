@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.precision import full
 from apex_lab.scene import Noise
 
 BOUND = 8.8
@@ -36,7 +37,7 @@ class Cells(NamedTuple):
 
 def split_gaussian(raw: Float[Tensor, "... two_D"], floor: float = 0.0) -> Gaussian:
     """Mean first, raw standard deviation second: std = softplus(raw) + floor. Single precision under autocast too."""
-    mean, spread = raw.float().chunk(2, dim=-1)
+    mean, spread = full(raw).chunk(2, dim=-1)
     return Gaussian(mean, F.softplus(spread) + floor)
 
 
