@@ -24,7 +24,7 @@ from apex_lab.models.scalor.windows import AnchoredSize, FreeSize, discovered, p
 from apex_lab.nn.distributions import Gaussian, kl_gaussian
 from apex_lab.nn.spatial_transformer import crop_weights
 from apex_lab.scene import Noise
-from apex_lab.schedules import Exponential, Linear
+from apex_lab.training.schedules import Exponential, Linear
 from tests.models.scalor.fixture import array
 
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, laid_out, same
 from apex_lab.models.scalor.latents import gaussian_of
 from apex_lab.nn.distributions import Gaussian
-from apex_lab.nn.parts import joined, part_size
+from apex_lab.nn.splitting import joined, part_size
 
 DecoderKind = Literal["strong", "weak"]
 

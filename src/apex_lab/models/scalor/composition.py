@@ -10,8 +10,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from apex_lab.models.scalor.latents import GUARD, full_precision
-from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import Paster
+from apex_lab.nn.splitting import joined, part_size
 
 SCALE_GUARD = 1e-9
 """Added to a box's size where it is divided by."""

@@ -16,7 +16,7 @@ from apex_lab.models.scalor.latents import GUARD, Sampler, bounded_logit, full_p
 from apex_lab.models.scalor.recompute import Recompute
 from apex_lab.models.scalor.windows import SizeRule, discovered, window_of
 from apex_lab.nn.distributions import Gaussian
-from apex_lab.nn.parts import part_size
+from apex_lab.nn.splitting import part_size
 
 MASK_CODE = 32
 

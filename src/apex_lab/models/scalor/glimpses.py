@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, laid_out, same
 from apex_lab.models.scalor.latents import full_precision
-from apex_lab.nn.parts import joined, part_size
 from apex_lab.nn.spatial_transformer import crop
+from apex_lab.nn.splitting import joined, part_size
 
 CODE = 128
 """Length of the glimpse encoder's output."""

@@ -12,7 +12,7 @@ from apex_lab.models.scalor.composition import Layers, paster_of
 from apex_lab.models.scalor.latents import GUARD
 from apex_lab.models.scalor.rollout import Step, joined_candidates
 from apex_lab.models.scalor.windows import window_of
-from apex_lab.nn.parts import part_size
+from apex_lab.nn.splitting import part_size
 
 Readout = Literal["rendering", "overlay"]
 
