@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,7 +13,10 @@ import torch
 from apex_lab.base.errors import UserError
 from apex_lab.tables.found import SeedRun, collect, read_arrangement
 from apex_lab.training.learner import Learner
+from apex_lab.training.schedules import Constant
+from apex_lab.training.update import WeightUpdate
 from tests.tables.folders import run_folder
+from tests.tiny import Layers
 
 
 def only(outputs: Path) -> SeedRun:
@@ -53,9 +55,10 @@ def test_outputs_that_are_a_file(tmp_path: Path) -> None:
 
 
 def test_what_the_learner_says_of_a_loss_that_is_not_finite_makes_a_failed_seed(tmp_path: Path) -> None:
-    learner: Any = SimpleNamespace(latest={"train/loss": torch.tensor(float("nan"))}, step=7)
+    update = WeightUpdate(Layers(), {}, {"error": Constant(1.0)}, step=7)
+    update.latest = {"train/loss": torch.tensor(float("nan"))}
     with pytest.raises(UserError) as error:
-        Learner.fetch(learner)
+        Learner(update, torch.optim.SGD).fetch()
     run_folder(tmp_path, "gswm", 0, status="failed", reason=str(error.value))
     run = only(tmp_path)
     assert (run.state, run.failure) == ("diverged", "its loss was not finite")

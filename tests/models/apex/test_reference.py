@@ -6,18 +6,18 @@ import copy
 
 import pytest
 import torch
-from apex_lab.benchmark.grid import GridPaster, grid_crop
-from apex_lab.benchmark.straightforward import Straightforward
 
 from apex_lab.config.schema import build_model, build_schedules
 from apex_lab.models.apex import Apex
 from apex_lab.nn.spatial_transformer import Paster, crop
-from apex_lab.scene import schedule_at
+from apex_lab.scene import Context, schedule_at
 from tests.conftest import compose_job
+from tests.reference.apex import Straightforward
+from tests.reference.grid import GridPaster, grid_crop
 
 
-def pair(*words: str, render_top: int | None = None) -> tuple[Apex, Straightforward, dict[str, torch.Tensor]]:
-    """The tiny APEX, its straightforward variant with the same weights, and the schedule of some step."""
+def pair(*words: str, render_top: int | None = None) -> tuple[Apex, Straightforward, Context]:
+    """The tiny APEX, its straightforward variant with the same weights, and the context of some step."""
     job = compose_job("model=apex", "data=p2d", "scale=smoke", "model.start_presence=0.5", *words)
     model = build_model(job.config)
     assert isinstance(model, Apex)
@@ -30,7 +30,8 @@ def pair(*words: str, render_top: int | None = None) -> tuple[Apex, Straightforw
     assert isinstance(variant, Straightforward)
     variant.load_state_dict(model.state_dict())
     schedule = {name: value(3) for name, value in build_schedules(job.config).items()}
-    return model, variant, schedule_at({**schedule, "sigma_fg_scale": 2.5, "sigma_bg_scale": 1.6})
+    scales = {"sigma_fg_scale": 2.5, "sigma_bg_scale": 1.6}
+    return model, variant, Context(schedule_at({**schedule, **scales}), detail=True)
 
 
 VIDEO = torch.rand(3, 4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
@@ -47,8 +48,8 @@ VIDEO = torch.rand(3, 4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
     ids=" ".join,
 )
 def test_the_variant_gives_the_same_terms_masks_and_gradients(words: tuple[str, ...]) -> None:
-    model, variant, schedule = pair("model.render_top=null", *words)
-    scenes = [each.eval()(VIDEO, schedule) for each in (model, variant)]
+    model, variant, context = pair("model.render_top=null", *words)
+    scenes = [each.eval()(VIDEO, context) for each in (model, variant)]
     fast, plain = scenes
     assert (fast.ids[:, :, :-1] > 0).any()
     assert torch.equal(fast.ids, plain.ids)
@@ -71,7 +72,7 @@ def test_the_variant_gives_the_same_terms_masks_and_gradients(words: tuple[str, 
 
 
 def test_cells_that_hold_nothing_make_no_difference_to_a_rendered_frame() -> None:
-    model, variant, schedule = pair("model.render_top=6", "model.max_objects=16")
+    model, variant, context = pair("model.render_top=6", "model.max_objects=16")
     last = model.discovery.head_pres[-1]
     assert isinstance(last, torch.nn.Linear)
     present = torch.tensor(16)
@@ -79,7 +80,7 @@ def test_cells_that_hold_nothing_make_no_difference_to_a_rendered_frame() -> Non
         while present.max() > 6:  # until no frame has more objects than are rendered
             last.bias.sub_(0.1)
             variant.load_state_dict(model.state_dict())
-            fast, plain = (each.eval()(VIDEO, schedule) for each in (model, variant))
+            fast, plain = (each.eval()(VIDEO, context) for each in (model, variant))
             present = (plain.ids[:, :, :-1] > 0).sum(-1)
     assert present.max() > 0
     torch.testing.assert_close(fast.terms["nll"], plain.terms["nll"], rtol=2e-5, atol=1e-3)
