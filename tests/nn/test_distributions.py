@@ -5,6 +5,7 @@ import torch
 from torch.distributions import Bernoulli, Normal, RelaxedBernoulli, kl_divergence
 
 from apex_lab.nn.distributions import Gaussian, gaussian_from, kl_bernoulli, kl_gaussian, relaxed_bernoulli
+from apex_lab.scene import Noise
 
 
 def test_kl_gaussian_both_directions_against_monte_carlo() -> None:
@@ -37,9 +38,9 @@ def test_kl_bernoulli() -> None:
 def test_relaxed_bernoulli_is_above_one_half_as_often_as_it_should() -> None:
     torch.manual_seed(1)
     for prob in (0.03, 0.4, 0.95):
-        z = relaxed_bernoulli(torch.full((200_000,), prob), torch.tensor(0.7))
+        z = relaxed_bernoulli(torch.full((200_000,), prob), torch.tensor(0.7), Noise())
         assert abs((z > 0.5).double().mean() - prob) < 0.004
-    cold = relaxed_bernoulli(torch.full((10_000,), 0.5), torch.tensor(0.01))
+    cold = relaxed_bernoulli(torch.full((10_000,), 0.5), torch.tensor(0.01), Noise())
     assert ((cold < 0.01) | (cold > 0.99)).double().mean() > 0.9
 
 
@@ -56,7 +57,8 @@ def test_relaxed_bernoulli_has_the_distribution_of_torch_s(prob: float, temperat
     """Against the closed-form cumulative distribution of samples, and against the density that torch gives."""
     torch.manual_seed(2)
     n = 100_000
-    z = relaxed_bernoulli(torch.full((n,), prob, dtype=torch.float64), torch.tensor(temperature)).sort().values
+    probs = torch.full((n,), prob, dtype=torch.float64)
+    z = relaxed_bernoulli(probs, torch.tensor(temperature), Noise()).sort().values
     # P(z <= x) = sigmoid(temperature logit(x) - logit(prob)); Kolmogorov-Smirnov at a level of 1e-4
     logit = torch.logit(torch.tensor(prob, dtype=torch.float64))
     expected = torch.sigmoid(temperature * torch.logit(z) - logit)
@@ -70,7 +72,7 @@ def test_relaxed_bernoulli_has_the_distribution_of_torch_s(prob: float, temperat
 
 def test_relaxed_bernoulli_gives_gradients_to_the_probability_alone() -> None:
     prob = torch.tensor([0.0, 1e-9, 0.3, 1.0], requires_grad=True)
-    z = relaxed_bernoulli(prob, torch.tensor(0.3))
+    z = relaxed_bernoulli(prob, torch.tensor(0.3), Noise())
     z.sum().backward()
     assert prob.grad is not None
     assert prob.grad.isfinite().all()
@@ -81,10 +83,10 @@ def test_relaxed_bernoulli_gives_gradients_to_the_probability_alone() -> None:
 def test_gaussian_samples_have_their_mean_and_spread_and_the_mean_is_what_evaluation_takes() -> None:
     torch.manual_seed(3)
     d = Gaussian(torch.tensor([1.0, -2.0]).expand(200_000, 2), torch.tensor([0.5, 2.0]).expand(200_000, 2))
-    z = d.sample(stochastic=True)
+    z = d.sample(Noise())
     torch.testing.assert_close(z.mean(0), d.mean[0], rtol=0, atol=0.03)
     torch.testing.assert_close(z.std(0), d.std[0], rtol=0.02, atol=0)
-    assert d.sample(stochastic=False) is d.mean
+    assert d.sample(None) is d.mean
 
 
 def test_kl_bernoulli_against_monte_carlo_in_both_directions() -> None:

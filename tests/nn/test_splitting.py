@@ -9,7 +9,7 @@ from torch import Tensor
 from apex_lab.config.schema import build_model, build_schedules
 from apex_lab.nn import splitting as parts
 from apex_lab.nn.splitting import joined, part_size
-from apex_lab.scene import schedule_at
+from apex_lab.scene import Context, schedule_at
 from tests.conftest import compose_job
 
 
@@ -41,7 +41,7 @@ def test_apex_gives_the_same_in_parts(monkeypatch: pytest.MonkeyPatch, words: tu
     def told(cached: int) -> tuple[dict[str, Tensor], list[Tensor]]:
         monkeypatch.setattr(parts, "CACHED", cached)
         torch.manual_seed(1)
-        scene = model.train()(video, schedule)
+        scene = model.train()(video, Context(schedule))
         gradients = torch.autograd.grad(
             sum(term.sum() for term in scene.terms.values()), list(model.parameters()), allow_unused=True
         )

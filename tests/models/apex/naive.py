@@ -222,7 +222,7 @@ def explain(model: Apex, video: Tensor, p0: float, scales: tuple[float, float]) 
     slots: list[Thing | None] = [None] * model.max_objects
     next_id = 1
     z_before: Tensor | None = None
-    for image, e in zip(video, model.encoder(video[None])[0], strict=True):
+    for image, e in zip(video, model.encoder(video[None])[0][0], strict=True):
         moved = [propagate(model, e, thing, told) if thing is not None else None for thing in slots]
         old = [thing for thing in moved if thing is not None and thing.present]
         s = torch.zeros(size, size, dtype=torch.float64)

@@ -23,8 +23,8 @@ from apex_lab.models.apex import (
 )
 from apex_lab.models.apex.objective import DiscoveryPrior
 from apex_lab.models.apex.objects import Proposals
-from apex_lab.models.apex.rollout import Step
-from apex_lab.scene import Scene, Schedule, schedule_at
+from apex_lab.models.apex.rollout import State, Step
+from apex_lab.scene import Context, Noise, Scene, schedule_at
 
 SIZE = 32
 SCHEDULE = schedule_at(
@@ -37,6 +37,7 @@ SCHEDULE = schedule_at(
         "sigma_bg_scale": 1.0,
     }
 )
+CONTEXT = Context(SCHEDULE, detail=True)
 
 
 def parts() -> dict[str, Any]:
@@ -126,9 +127,9 @@ def redraw(model: nn.Module) -> None:
 def propose(model: Apex) -> Proposals:
     """What discovery proposes in two videos; the means."""
     x = video(2, 5)
-    features = model.encoder(x)
+    features, _ = model.encoder(x)
     look_at, _ = model.glimpses.sources(x, features)
-    return model.discovery(features, look_at, model.glimpses, model.appearance, False)
+    return model.discovery(features, look_at, model.glimpses, model.appearance, None)
 
 
 @torch.no_grad()
@@ -182,10 +183,17 @@ class Inside:
         steps: list[Step] = []
         backdrops: list[torch.Tensor] = []
 
-        def spy(video: torch.Tensor, found: Proposals, left: Step, values: Schedule) -> Scene:
+        def spy(
+            video: torch.Tensor,
+            found: Proposals,
+            left: Step,
+            context: Context,
+            noise: Noise | None,
+            state_with: Callable[[torch.Tensor], State],
+        ) -> Scene:
             proposals.append(found)
             steps.append(left)
-            return explain(video, found, left, values)
+            return explain(video, found, left, context, noise, state_with)
 
         def listen(z: torch.Tensor) -> torch.Tensor:
             backdrops.append(z)
@@ -193,7 +201,7 @@ class Inside:
 
         model._explain, model.background.decode = spy, listen  # type: ignore[method-assign]
         try:
-            self.scene = model(x, schedule)
+            self.scene = model(x, Context(schedule, detail=True))
         finally:
             model._explain, model.background.decode = explain, decode  # type: ignore[method-assign]
         self.proposals, self.steps = proposals[0], steps[0]

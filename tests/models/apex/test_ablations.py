@@ -14,7 +14,7 @@ from torch import Tensor
 from apex_lab.config.schema import Config, build_model, build_optimizer, build_schedules, build_weights
 from apex_lab.models.apex import Apex, FeatureGlimpses, GaussianLikelihood, ImageGlimpses
 from apex_lab.scene import Scene
-from apex_lab.training.learner import Learner
+from apex_lab.training.update import WeightUpdate, named_parameters, remember_rates
 from tests.conftest import REPOSITORY, compose_job
 from tests.models.apex import naive
 from tests.models.apex.small import SIZE, Inside, resolved, video
@@ -107,15 +107,12 @@ def test_all_other_weights_are_the_same_from_the_same_seed(name: str) -> None:
 def test_it_trains(name: str) -> None:
     config, model = checked(name), built(name)
     schedules, weights = build_schedules(config), build_weights(config)
-    learner = Learner(model, lambda p: build_optimizer(config, p), schedules, weights, step=10_000)
-    optimizer = learner.configure_optimizers()
+    update = WeightUpdate(model, schedules, weights, step=10_000)
+    optimizer = remember_rates(build_optimizer(config, named_parameters(model)))
     before = {key: value.clone() for key, value in model.named_parameters()}
-    for batch_idx in range(2):
-        loss = learner.training_step({"video": (255 * video(2, 3)).byte()}, batch_idx)
-        assert loss.isfinite()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+    for _ in range(2):
+        update((255 * video(2, 3)).byte(), optimizer)
+        assert update.latest["train/loss"].isfinite()
     assert [key for key, p in model.named_parameters() if p.grad is None or not p.grad.isfinite().all()] == []
     assert [key for key, p in model.named_parameters() if torch.equal(p, before[key])] == []
 
@@ -124,7 +121,7 @@ def test_no_entropy_takes_the_entropy_out_of_the_loss_and_nothing_else() -> None
     base, other = seen(built()), seen(built("no_entropy"))
     same_scene(base.scene, other.scene, ALL_TERMS)
     losses = [
-        Learner(built(), lambda p: torch.optim.SGD(p), {}, build_weights(checked(name))).loss(base.scene.terms)
+        WeightUpdate(built(), {}, build_weights(checked(name))).objective(base.scene.terms)
         for name in (None, "no_entropy")
     ]
     entropy = base.scene.terms["mask_entropy"].mean()

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from apex_lab.models.apex import Apex, Background
-from apex_lab.scene import schedule_at
+from apex_lab.scene import Context, schedule_at
 from tests.models.apex import naive
 from tests.models.apex.small import SCHEDULE, SIZE, lively, video
 
@@ -19,9 +19,8 @@ SCALES = (1.25, 0.75)  # of sigma_fg and sigma_bg
 def check(model: Apex, x: torch.Tensor) -> list[naive.Told]:
     """Compares everything that the two say; returns what the slow one told."""
     with torch.no_grad():
-        scene = model(
-            x, {**SCHEDULE, **schedule_at(dict(zip(("sigma_fg_scale", "sigma_bg_scale"), SCALES, strict=True)))}
-        )
+        scales = schedule_at(dict(zip(("sigma_fg_scale", "sigma_bg_scale"), SCALES, strict=True)))
+        scene = model(x, Context({**SCHEDULE, **scales}))
     told = [naive.explain(model, one, P0, SCALES) for one in x]
     for b, want in enumerate(told):
         assert scene.ids[b, :, :-1].tolist() == want.slots

@@ -26,7 +26,7 @@ def averaged(image: Tensor) -> Tensor:
 @torch.no_grad()
 def test_features_are_dla_and_colours_and_what_the_lstm_makes_of_both() -> None:
     net, x = encoder(), video(2, 4).double()
-    got = net(x)
+    got, state = net(x)
     assert got.shape == (2, 4, 8, SIZE // 4, SIZE // 4)
     for b in range(2):
         h = c = torch.zeros(1, 8, SIZE // 4, SIZE // 4, dtype=torch.float64)
@@ -40,6 +40,8 @@ def test_features_are_dla_and_colours_and_what_the_lstm_makes_of_both() -> None:
             for part in (net.dla(image[None]), colour, h):
                 assert part.std() > 0.01  # none of the three could be missing unseen
             torch.testing.assert_close(got[b, t], (f + h)[0], rtol=0, atol=1e-12)
+        for last, want in zip(state, (h, c), strict=True):
+            torch.testing.assert_close(last[b], want[0], rtol=0, atol=1e-12)
 
 
 @torch.no_grad()
@@ -50,9 +52,9 @@ def test_with_dla_and_lstm_silent_the_colours_remain() -> None:
             p.zero_()
     for t in range(2):
         want = torch.einsum("fc,cyx->fyx", net.colour.weight[:, :, 0, 0], averaged(x[0, t] - 0.5))
-        torch.testing.assert_close(net(x)[0, t], want, rtol=0, atol=1e-12)
+        torch.testing.assert_close(net(x)[0][0, t], want, rtol=0, atol=1e-12)
     grey = torch.full_like(x, 0.5)
-    assert (net(grey) == 0).all()  # colours are told from grey
+    assert (net(grey)[0] == 0).all()  # colours are told from grey
 
 
 @torch.no_grad()

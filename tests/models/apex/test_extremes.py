@@ -11,7 +11,7 @@ from apex_lab.models.apex.likelihood import Likelihood
 from apex_lab.models.apex.masks import MaskNormalisation
 from apex_lab.models.apex.objective import mask_entropy
 from apex_lab.nn.spatial_transformer import Paster
-from apex_lab.scene import schedule_at
+from apex_lab.scene import Context, schedule_at
 from tests.models.apex.small import SIZE, tiny, video
 
 COLD = schedule_at(
@@ -36,7 +36,7 @@ def push(head: nn.Module, value: float) -> None:
 
 def finite(model: Apex, x: torch.Tensor) -> None:
     torch.manual_seed(0)
-    terms = model.train()(x, COLD).terms
+    terms = model.train()(x, Context(COLD)).terms
     assert all(value.isfinite().all() for value in terms.values())
     sum(terms.values()).sum().backward()  # type: ignore[union-attr]
     assert [n for n, p in model.named_parameters() if p.grad is not None and not p.grad.isfinite().all()] == []

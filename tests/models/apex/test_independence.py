@@ -11,7 +11,7 @@ from apex_lab.models.apex.objects import Proposals
 from apex_lab.models.apex.slots import Carried, carry
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.scene import Scene
-from tests.models.apex.small import SCHEDULE, Inside, lively, tiny, video
+from tests.models.apex.small import CONTEXT, Inside, lively, tiny, video
 
 TERMS = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
 
@@ -46,7 +46,7 @@ def test_permuting_slots_after_every_frame_permutes_the_objects_and_changes_noth
 ) -> None:
     model, x = lively(max_objects=slots, render_top=3).double().eval(), video(2, 5).double()
     with torch.no_grad():
-        base = model(x, SCHEDULE)
+        base = model(x, CONTEXT)
         order = torch.randperm(slots, generator=torch.Generator().manual_seed(1))
         assert order.tolist() != list(range(slots))
 
@@ -55,7 +55,7 @@ def test_permuting_slots_after_every_frame_permutes_the_objects_and_changes_noth
             return Carried(kept.source[:, order], kept.valid[:, order], kept.ids[:, order], kept.next_id)
 
         monkeypatch.setattr(module, "carry", shuffled)
-        other = model(x, SCHEDULE)
+        other = model(x, CONTEXT)
     assert not torch.equal(base.ids, other.ids)
     same_objects(base, other)
 
@@ -65,7 +65,7 @@ def test_permuting_the_discovery_cells_changes_nothing(render_top: int | None) -
     model, x = lively(render_top=render_top).double().eval(), video(2, 5).double()
     order = torch.randperm(16, generator=torch.Generator().manual_seed(2))
     with torch.no_grad():
-        base = model(x, SCHEDULE)
+        base = model(x, CONTEXT)
         discover = model.discovery.forward
 
         def shuffled(*args: object) -> Proposals:
@@ -77,7 +77,7 @@ def test_permuting_the_discovery_cells_changes_nothing(render_top: int | None) -
             return Proposals(*fields)  # type: ignore[arg-type]
 
         model.discovery.forward = shuffled  # type: ignore[method-assign]
-        other = model(x, SCHEDULE)
+        other = model(x, CONTEXT)
     assert len({i for video_ids in base.ids.tolist() for frame in video_ids for i in frame}) > 5
     same_objects(base, other)
 
@@ -119,7 +119,7 @@ def test_the_background_s_prior_is_standard_normal_first_and_then_knows_the_fram
 @pytest.mark.parametrize("term", TERMS)
 def test_no_term_of_a_video_has_a_gradient_in_another_video(term: str) -> None:
     model, x = lively().eval(), video().requires_grad_()
-    terms = model(x, SCHEDULE).terms
+    terms = model(x, CONTEXT).terms
     (gradient,) = torch.autograd.grad(terms[term][1], x)
     assert gradient[1].abs().sum() > 0
     assert (gradient[[0, 2]] == 0).all()
@@ -129,8 +129,8 @@ def test_a_video_s_scene_is_the_same_beside_other_videos() -> None:
     model = lively().double().eval()
     x, y = video().double(), 1 - video().double()
     with torch.no_grad():
-        a = model(x, SCHEDULE)
-        b = model(torch.cat([y[:1], x[1:2], y[2:], x[2:]]), SCHEDULE)
+        a = model(x, CONTEXT)
+        b = model(torch.cat([y[:1], x[1:2], y[2:], x[2:]]), CONTEXT)
     assert torch.equal(a.ids[1], b.ids[1])
     torch.testing.assert_close(a.masks[1], b.masks[1], rtol=0, atol=1e-10)
     for name in TERMS:

@@ -16,8 +16,8 @@ from apex_lab.models.apex.objects import Objects
 from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.spatial_transformer import Paster
-from apex_lab.scene import Scene
-from tests.models.apex.small import SCHEDULE, parts, tiny, video
+from apex_lab.scene import Context, Scene, Statistics
+from tests.models.apex.small import CONTEXT, SCHEDULE, parts, tiny, video
 
 
 def check_scene(scene: Scene, b: int, t: int, slots: int) -> None:
@@ -40,7 +40,7 @@ def check_scene(scene: Scene, b: int, t: int, slots: int) -> None:
 @pytest.mark.parametrize("training", [True, False])
 def test_scene_keeps_the_contract(training: bool) -> None:
     model = tiny().train(training)
-    scene = model(video(), SCHEDULE)
+    scene = model(video(), CONTEXT)
     check_scene(scene, 3, 4, 3)
     assert set(scene.terms) == set(model.term_names)
     assert (scene.ids[:, :, :3] >= 0).any()
@@ -51,7 +51,7 @@ def test_an_identity_never_comes_back() -> None:
     reappeared = vanished = 0
     for seed in range(10):
         torch.manual_seed(seed)
-        ids = model(video(3, 6), SCHEDULE).ids[..., :3]
+        ids = model(video(3, 6), CONTEXT).ids[..., :3]
         for b in range(3):
             frames = [set(ids[b, t].tolist()) - {-1} for t in range(6)]
             for identity in set().union(*frames):
@@ -66,9 +66,9 @@ def test_an_identity_never_comes_back() -> None:
 def test_a_video_does_not_depend_on_the_rest_of_its_batch() -> None:
     model = tiny().eval()
     x = video()
-    together = model(x, SCHEDULE)
+    together = model(x, CONTEXT)
     for i in range(3):
-        alone = model(x[i : i + 1], SCHEDULE)
+        alone = model(x[i : i + 1], CONTEXT)
         torch.testing.assert_close(alone.masks[0], together.masks[i], rtol=1e-4, atol=1e-5)
         assert torch.equal(alone.ids[0], together.ids[i])
         for name in alone.terms:
@@ -78,7 +78,7 @@ def test_a_video_does_not_depend_on_the_rest_of_its_batch() -> None:
 def test_no_video_influences_the_gradient_of_another() -> None:
     model = tiny().eval()
     x = video().requires_grad_()
-    model(x, SCHEDULE).terms["nll"][0].backward()
+    model(x, CONTEXT).terms["nll"][0].backward()
     assert x.grad is not None
     assert x.grad[0].abs().sum() > 0
     assert (x.grad[1:] == 0).all()
@@ -89,7 +89,7 @@ def test_the_future_does_not_change_the_past() -> None:
     x = video()
     y = x.clone()
     y[:, 3] = 1 - y[:, 3]
-    a, b = model(x, SCHEDULE), model(y, SCHEDULE)
+    a, b = model(x, CONTEXT), model(y, CONTEXT)
     torch.testing.assert_close(a.masks[:, :3], b.masks[:, :3], rtol=1e-4, atol=1e-5)
 
 
@@ -122,7 +122,7 @@ def test_permuting_slots_permutes_propagation() -> None:
 
     def propagate(state: Objects, valid: torch.Tensor) -> Objects:
         t = SCHEDULE["temperature"]
-        return model.propagation(state, model.glimpses, model.appearance, e, e, valid, t, False)[0]
+        return model.propagation(state, model.glimpses, model.appearance, e, e, valid, t, None)[0]
 
     a, b = propagate(state, valid), propagate(Objects(*(x[:, order] for x in state)), valid[:, order])
     for x, y in zip(a, b, strict=True):
@@ -132,7 +132,7 @@ def test_permuting_slots_permutes_propagation() -> None:
 def test_gradients_reach_every_parameter() -> None:
     model = tiny().train()
     torch.manual_seed(5)
-    sum(model(video(), SCHEDULE).terms.values()).sum().backward()
+    sum(model(video(), CONTEXT).terms.values()).sum().backward()
     missing = [n for n, p in model.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0]
     assert missing == []
     assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
@@ -146,7 +146,7 @@ def test_gradients_stay_finite_with_all_or_no_objects_and_extreme_windows(logit:
         model.discovery.head_pres[-1].weight.zero_()
         model.discovery.head_pres[-1].bias.fill_(logit)
         model.discovery.head_where.bias[:2] = size
-    scene = model(video(), SCHEDULE)
+    scene = model(video(), CONTEXT)
     assert (scene.ids[:, 0, :3] >= 0).all() if logit > 0 else (scene.ids[:, :, :3] == -1).all()
     sum(scene.terms.values()).sum().backward()
     assert all(p.grad is None or p.grad.isfinite().all() for p in model.parameters())
@@ -159,7 +159,7 @@ def test_the_same_seed_gives_the_same_losses() -> None:
         values = []
         for step in range(4):
             torch.manual_seed(step)
-            loss = sum(model(video(), SCHEDULE).terms.values()).mean()
+            loss = sum(model(video(), CONTEXT).terms.values()).mean()
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
@@ -175,7 +175,7 @@ def test_z_what_zero_gives_discovery_and_propagation_the_same_appearance() -> No
     """Discovery infers z_what with the same networks as propagation, from z_what_0 = 0."""
     model = tiny().eval()
     e = torch.randn(1, 1, 8, 8, 8)
-    proposals = model.discovery(e, e, model.glimpses, model.appearance, False)
+    proposals = model.discovery(e, e, model.glimpses, model.appearance, None)
     code = model.glimpses.look(e[:, 0], window_of(proposals.place[:, 0])).flatten(0, 1)
     q, _ = model.appearance(code, torch.zeros(16, 6), torch.zeros(16, 12))
     torch.testing.assert_close(proposals.q_what.mean[0, 0], q.mean)
@@ -195,7 +195,7 @@ def test_z_what_zero_gives_discovery_and_propagation_the_same_appearance() -> No
 )
 def test_every_variant_trains_a_step(part: dict) -> None:
     model = tiny(**part).train()
-    scene = model(video(), SCHEDULE)
+    scene = model(video(), CONTEXT)
     check_scene(scene, 3, 4, 3)
     sum(scene.terms.values()).sum().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in model.parameters())
@@ -204,11 +204,11 @@ def test_every_variant_trains_a_step(part: dict) -> None:
 def test_the_background_starts_at_the_median() -> None:
     median = torch.rand(3, 32, 32) * 0.9 + 0.05
     model = tiny()
-    model.initialise(median)
+    model.initialise(Statistics(lambda: median))
     picture = model.background.decode(torch.zeros(1, 6))[0]
     assert (picture - median).abs().max() < 0.06
     plain = tiny(background=Background(32, 6, 6, "none"))
-    plain.initialise(median)
+    plain.initialise(Statistics(lambda: median))
     assert plain.background.bias_image is None
 
 
@@ -216,14 +216,15 @@ def test_refusals() -> None:
     with pytest.raises(ValueError, match=r"model\.image_size=48"):
         Apex(48, **parts())
     with pytest.raises(ValueError, match="built for 32 px"):
-        tiny()(torch.rand(1, 2, 3, 64, 64), SCHEDULE)
+        tiny()(torch.rand(1, 2, 3, 64, 64), CONTEXT)
 
 
 @pytest.mark.parametrize(("fg", "bg"), [(1.0, 1.6), (2.5, 1.0)])
 def test_the_scales_of_the_sigmas_widen_those_of_the_whole_model(fg: float, bg: float) -> None:
     def terms(sigma_fg: float, sigma_bg: float, **scales: float) -> dict[str, torch.Tensor]:
         model = tiny(likelihood=MixtureLikelihood(sigma_fg, sigma_bg)).eval()
-        return model(video(), {**SCHEDULE, **{name: torch.tensor(scale) for name, scale in scales.items()}}).terms
+        schedule = {**SCHEDULE, **{name: torch.tensor(scale) for name, scale in scales.items()}}
+        return model(video(), Context(schedule)).terms
 
     scaled = terms(0.1, 0.05, sigma_fg_scale=fg, sigma_bg_scale=bg)
     wide, narrow = terms(0.1 * fg, 0.05 * bg), terms(0.1, 0.05)
@@ -234,8 +235,8 @@ def test_the_scales_of_the_sigmas_widen_those_of_the_whole_model(fg: float, bg: 
 
 def test_the_posterior_is_bayes_rule_on_what_the_scene_shows() -> None:
     model = tiny().eval()
-    scene = model(video(), SCHEDULE)
-    found = model.posterior(scene, video(), {**SCHEDULE, "sigma_bg_scale": torch.tensor(2.0)})
+    scene = model(video(), CONTEXT)
+    found = model.posterior(scene, video(), Context({**SCHEDULE, "sigma_bg_scale": torch.tensor(2.0)}))
     assert model.has_posterior
     assert scene.means is not None
     sigma = torch.where(scene.background, 0.08, 0.1)[:, None, None, None]
@@ -246,11 +247,11 @@ def test_the_posterior_is_bayes_rule_on_what_the_scene_shows() -> None:
     assert not torch.allclose(found, scene.masks, atol=0.01)
 
 
-def test_a_posterior_is_refused_in_training_and_under_one_gaussian() -> None:
-    model = tiny()
-    with pytest.raises(ValueError, match="evaluation mode"):
-        model.posterior(model(video(), SCHEDULE), video(), SCHEDULE)
+def test_a_posterior_is_refused_without_detail_and_under_one_gaussian() -> None:
+    model = tiny().eval()
+    with pytest.raises(ValueError, match=r"no means: give Context\(detail=True\)"):
+        model.posterior(model(video(), Context(SCHEDULE)), video(), CONTEXT)
     model = tiny(likelihood=GaussianLikelihood()).eval()
     assert not model.has_posterior
     with pytest.raises(TypeError, match="Apex has no mixture likelihood"):
-        model.posterior(model(video(), SCHEDULE), video(), SCHEDULE)
+        model.posterior(model(video(), CONTEXT), video(), CONTEXT)

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from apex_lab.models.apex import Apex, ApexNormalisation, MixtureLikelihood
+from apex_lab.models.apex.rollout import Memory, State
 from apex_lab.nn.distributions import Gaussian
-from apex_lab.scene import schedule_at
+from apex_lab.scene import Context, schedule_at
 from tests.models.apex import naive
 from tests.models.apex.small import SCHEDULE, SIZE, Inside, lively, video
 
@@ -161,10 +162,12 @@ def test_presence_of_discoveries_is_what_propagation_left_open() -> None:
 
 
 def test_the_terms_in_float32_are_those_in_float64() -> None:
-    """The same latents and weights, and no new noise, through `_explain` in both precisions."""
+    """The same latents and weights, and no noise for the background, through `_explain` in both precisions."""
     model = lively()
     seen = trained(model)
-    model.eval()  # no new sample of the background
+
+    def stateless(z: Tensor) -> State:
+        return State((z, z), z, Memory.empty(2, 3, 1, 1, z), z)
 
     def in_float32(x: object) -> object:
         if isinstance(x, Tensor):
@@ -173,8 +176,10 @@ def test_the_terms_in_float32_are_those_in_float64() -> None:
         return type(x)(*(in_float32(y) for y in x))
 
     with torch.no_grad():
-        exact = model._explain(video(2, 4).double(), seen.proposals, seen.steps, SCHEDULE)
-        rounded = model.float()._explain(video(2, 4), in_float32(seen.proposals), in_float32(seen.steps), SCHEDULE)  # type: ignore[arg-type]
+        context = Context(SCHEDULE)
+        exact = model._explain(video(2, 4).double(), seen.proposals, seen.steps, context, None, stateless)
+        proposals, steps = in_float32(seen.proposals), in_float32(seen.steps)
+        rounded = model.float()._explain(video(2, 4), proposals, steps, context, None, stateless)  # type: ignore[arg-type]
     for name, value in exact.terms.items():
         torch.testing.assert_close(rounded.terms[name].double(), value, rtol=1e-4, atol=1e-3)
     assert (rounded.masks - exact.masks).abs().max() < 1e-5

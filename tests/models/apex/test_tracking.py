@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from apex_lab.models.apex import Apex, ScalorNormalisation
 from apex_lab.models.apex.masks import MaskNormalisation
 from apex_lab.nn.spatial_transformer import pixel_centres
-from apex_lab.scene import Scene, schedule_at
+from apex_lab.scene import Context, Scene, schedule_at
 from tests.models.apex.small import SIZE, tiny
 
 FRAMES, SIDE, STEP = 6, 8, 2
@@ -92,19 +92,17 @@ def ideal(masks: MaskNormalisation | None = None, stop_at: int | None = None) ->
 
 
 def follow(model: Apex, x: Tensor) -> Scene:
-    return model(
-        x,
-        schedule_at(
-            {
-                "temperature": 0.1,
-                "discovery_presence": 1e-3,
-                "carry": 1.0,
-                "discover": 0.0,
-                "sigma_fg_scale": 1.0,
-                "sigma_bg_scale": 1.0,
-            }
-        ),
+    schedule = schedule_at(
+        {
+            "temperature": 0.1,
+            "discovery_presence": 1e-3,
+            "carry": 1.0,
+            "discover": 0.0,
+            "sigma_fg_scale": 1.0,
+            "sigma_bg_scale": 1.0,
+        }
     )
+    return model(x, Context(schedule, detail=True))
 
 
 @pytest.mark.parametrize("masks", [None, ScalorNormalisation()])

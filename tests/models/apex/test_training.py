@@ -16,6 +16,7 @@ from apex_lab.models.apex.masks import ApexNormalisation, MaskNormalisation, Sca
 from apex_lab.models.apex.slots import gather_slots
 from apex_lab.models.apex.windows import MAX_LOGIT
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.scene import Context
 from tests.models.apex.small import SCHEDULE, Inside, lively, video
 
 SLOTS = 3
@@ -154,7 +155,7 @@ def test_gradient_of_the_objective_against_finite_differences(name: str, masks: 
 
     def objective() -> Tensor:
         torch.manual_seed(5)
-        return sum((term.sum() for term in model(x, values).terms.values()), start=x.new_zeros(()))
+        return sum((term.sum() for term in model(x, Context(values)).terms.values()), start=x.new_zeros(()))
 
     [gradient] = torch.autograd.grad(objective(), [weight])
     analytic = (gradient * along).sum().item()
