@@ -24,11 +24,16 @@ def test_the_wheel_holds_code_and_configuration_and_no_tests(wheel: Path) -> Non
     names = set(zipfile.ZipFile(wheel).namelist())
     for path in (REPOSITORY / "conf").rglob("*.yaml"):
         assert f"apex_lab/{path.relative_to(REPOSITORY)}" in names
+    assert "apex_lab/conf/recipe/apex/paper.yaml" in names
     for folder in ("src/apex_lab", "sims"):
         for path in (REPOSITORY / folder).rglob("*.py"):
             assert str(path.relative_to(REPOSITORY)).removeprefix("src/") in names
     tops = {name.split("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"apex_lab", "sims"}
+    # naive twins are an oracle of the tests and a baseline of the benchmark, both in the repository alone
+    twins = {path.name for path in (REPOSITORY / "tests" / "reference").glob("*.py")}
+    assert "apex.py" in twins
+    assert [name for name in names if "reference" in name.split("/") or "tests" in name.split("/")] == []
 
 
 def test_the_wheel_s_own_configuration_is_used_from_any_folder(wheel: Path, tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """The trained weights in sweeps/results fit the code: a change of the model that breaks them must ship new ones."""
 
+from pathlib import Path
+
 import pytest
 import torch
 
@@ -16,7 +18,7 @@ def test_something_is_shipped() -> None:
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_shipped_weights_load_and_explain_a_video(path: object) -> None:
+def test_shipped_weights_load_and_explain_a_video(path: Path) -> None:
     checkpoint = checkpoints.load(path)
     job = check_job(checkpoint["config"], checkpoint["choices"], needs_recipe=False)
     model = build_model(job.config).eval()
