@@ -1,7 +1,7 @@
 """Measures how fast a model trains and infers, in which part the time goes, and how much memory it takes.
 
 python -m apex_lab.bench
-python -m apex_lab.bench scale=cpu data.image_size=128 data.batch_size=4
+python -m apex_lab.bench scale=cpu data.image_size=128 clips.batch_size=4
 python -m apex_lab.bench +ablation=image_stn trainer=gpu trainer.compile=true
 
 Every row is measured in a process of its own, on random videos: no data set is needed.

@@ -49,7 +49,7 @@ def death(process: BaseProcess, what: str) -> UserError | RuntimeError:
         name = signal.Signals(-process.exitcode).name
         return UserError(
             f"{what} was ended by {name}, as happens when memory runs out: "
-            "lower data.batch_size, data.frames or data.image_size."
+            "lower clips.batch_size, data.frames or data.image_size."
         )
     return RuntimeError(f"{what} failed with exit code {process.exitcode}")
 

@@ -101,7 +101,7 @@ def _serve(asked: Comparison, name: str, parent: Connection) -> None:
     except EOFError:
         return
     except torch.OutOfMemoryError:
-        less = "lower data.batch_size, data.frames or data.image_size, or set bench.compare=false."
+        less = "lower clips.batch_size, data.frames or data.image_size, or set bench.compare=false."
         parent.send(UserError(f"The GPU's memory does not hold the step of {name}: {less}"))
 
 
