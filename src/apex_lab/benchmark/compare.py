@@ -79,7 +79,7 @@ def workload(asked: Comparison, name: str) -> Workload:
 
 
 def timed_step(work: Workload) -> Callable[[], tuple[float, float]]:
-    """A function that makes one training step and tells its seconds, and those of the processor."""
+    """A function that makes one training step and returns its seconds, and those of the processor."""
     step = work.step(training=True)
 
     def timed() -> tuple[float, float]:
@@ -141,7 +141,7 @@ def compare(asked: Comparison) -> dict[str, Any]:
 
     Each model has a process of its own, as in a training, so that none works in memory that another has left behind;
     they make their steps in turns, so that whatever else the machine does meets them alike. On the CPU the ratios are
-    told once more in processor time.
+    reported in processor time too.
 
     Raises:
         UserError: memory ran out.
