@@ -255,7 +255,7 @@ def test_asked_to_stop_it_stores_the_step_at_hand(
     process.send_signal(number)
     _, err = process.communicate()
     assert process.returncode == code
-    assert f"Stopped by {number.name}; the same command goes on from here." in err
+    assert f"Stopped by {number.name}; the same command resumes from here." in err
     assert record(run)["status"] == "failed"
     assert record(run)["reason"] == f"stopped by {number.name}"
     assert checkpoints.load(run / "checkpoints" / "last.ckpt")["step"] == record(run)["steps"] > 20

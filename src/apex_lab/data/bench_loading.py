@@ -21,7 +21,7 @@ FOREVER = 10**9
 
 def frames_per_second(data: P2D, batch_size: int, workers: int, seconds: float) -> float:
     """Frames per second of whole shuffled batches, as training takes them, measured after two batches of warm-up."""
-    lengths = [data.length(i) for i in range(len(data))]
+    lengths = [data.length(video) for video in range(len(data))]
     batches = ClipSampler(lengths, batch_size, seed=0, start=0, stop=FOREVER)
     source = iter(DataLoader(data, batch_sampler=batches, num_workers=workers))
     frames = 0
