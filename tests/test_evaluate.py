@@ -83,3 +83,36 @@ def test_what_cannot_be_evaluated_is_told(command: Callable[..., Ended], tmp_pat
         "++nothing=1": "Unknown key nothing = 1.",
     }.items():
         refused(command("evaluate", word), told)
+
+
+@pytest.mark.parametrize("words", [("data.data_seed=1",), ("data.test=3", "data.frames=4")])
+def test_other_data_are_scored_in_a_folder_of_their_own_that_says_which(
+    words: tuple[str, ...], trained: Path, command: Callable[..., Ended]
+) -> None:
+    before = (trained / "metrics.json").read_bytes()
+    ended = command("evaluate", f"checkpoint={trained}", "pictures=0", *words)
+    assert ended.code == 0, ended.err
+    assert (trained / "metrics.json").read_bytes() == before
+    [file] = trained.glob("evaluate/last_test_data_*/metrics.json")
+    found, own = (json.loads(text)["splits"]["test"] for text in (file.read_text(), before))
+    assert found["data_fingerprint"] == found["data"]["fingerprint"] != own["data_fingerprint"]
+    asked = {word.removeprefix("data.").partition("=")[0]: int(word.partition("=")[2]) for word in words}
+    settings = found["data"]["settings"]
+    assert [settings["seed" if key == "data_seed" else key] for key in asked] == list(asked.values())
+    assert found["videos"] == settings["test"]
+    assert found["total"]["ari"] != own["total"]["ari"]
+
+
+def test_videos_without_labels_are_drawn_and_exported_but_not_scored(
+    trained: Path, command: Callable[..., Ended]
+) -> None:
+    ended = command("evaluate", f"checkpoint={trained}", "data.labelled=false", "pictures=1", "export=npz")
+    assert ended.code == 0, ended.err
+    assert "test: 2 videos, 6 frames; unlabelled, so there are no scores" in ended.out
+    [file] = trained.glob("evaluate/last_test_data_*/metrics.json")
+    found = json.loads(file.read_text())["splits"]["test"]
+    assert found["labelled"] is False
+    assert found["total"] == {"videos": 2, "frames": 6}
+    assert found["terms"].keys() == {"error", "spread"}
+    assert (file.parent / "predictions" / "test.npz").is_file()
+    assert (file.parent / "view" / "test" / "film_strip.png").is_file()

@@ -88,7 +88,7 @@ def title(job: Evaluation) -> str:
 
 
 def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str]) -> Evaluation:
-    """Checks what is asked for, and reads every checkpoint once.
+    """Checks the command, and reads every checkpoint once.
 
     Raises:
         UserError: unknown key, impossible value, or something that cannot be evaluated; one sentence.
@@ -129,7 +129,7 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
 
 
 def evaluate(job: Evaluation) -> None:
-    """Scores, stores, draws; what fails does not keep the other checkpoints from being evaluated.
+    """Scores, stores, draws; a checkpoint that fails does not stop the others.
 
     Raises:
         UserError: some could not be evaluated.

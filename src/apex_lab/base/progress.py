@@ -16,7 +16,7 @@ class Meter:
     """Shows progress while it is open.
 
     Args:
-        title: what is done.
+        title: the unit of work.
         total: how many there are.
         done: how many were done before.
         seconds: between two lines where there is no terminal.

@@ -1,4 +1,4 @@
-"""Strict validation of plain values, and the wording of what is wrong: one sentence with key, value and what to do."""
+"""Strict validation of plain values, and the wording of faults: one sentence with key, value and what to do."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def validate(
     Validation goes through JSON, where a list stands for a tuple and a string for a path or an enumeration.
 
     Args:
-        schema: what is wanted.
+        schema: of the values.
         values: what came.
         key: where the values stand in the configuration, for the message.
         names: field of `schema` -> its key in the configuration, where they differ.

@@ -55,7 +55,7 @@ def death(process: BaseProcess, what: str) -> UserError | RuntimeError:
 
 
 def _serve(work: Callable[[Asked], Told], asked: Asked, send: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it too, and ends this process
     try:
         send.send(work(asked))
     except UserError as error:

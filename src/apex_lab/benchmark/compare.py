@@ -92,7 +92,7 @@ def timed_step(work: Workload) -> Callable[[], tuple[float, float]]:
 
 def _serve(asked: Comparison, name: str, parent: Connection) -> None:
     """Makes a step whenever the parent asks for one, and ends with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent hears it too, and ends this process
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it too, and ends this process
     step = timed_step(workload(asked, name))
     try:
         while True:

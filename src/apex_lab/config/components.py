@@ -68,8 +68,8 @@ def check(node: Node, key: str, supplied: Iterable[str] = ()) -> None:
         key: where the node stands in the configuration, for messages.
         supplied: parameters that code gives at construction, not the configuration.
 
-    A node with `_partial_: true` makes a function that builds the component when it gets what is missing; so parameters
-    may be missing.
+    A node with `_partial_: true` makes a function that builds the component when it gets the missing parameters; so
+    parameters may be missing.
 
     Raises:
         UserError: unknown key, missing key, wrong type or value out of bounds; one sentence.

@@ -129,7 +129,7 @@ class Job:
 
     Attributes:
         config: the typed root.
-        raw: the same as plain containers with all interpolations resolved; what is stored and fingerprinted.
+        raw: the same as plain containers with all interpolations resolved; stored and fingerprinted.
         choices: group -> the word chosen for it ("model" -> "apex"); a group that was not chosen is missing.
         overrides: the words on the command line, without sweeps.
     """

@@ -104,7 +104,7 @@ def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
     """Evaluates one checkpoint, or reports that it was done before; prints rows and paths.
 
     Args:
-        request: what is asked for.
+        request: of the command.
         file: the checkpoint.
         alone: it is the only one, so a folder that was given is its own.
 

@@ -49,7 +49,7 @@ def check_output(path: Path, read: Sequence[Path | None] = ()) -> None:
         UserError: it is a folder or one of `read`, or lies in a folder that cannot be written.
     """
     if any(given is not None and given.resolve() == path.resolve() for given in read):
-        raise UserError(f"output = {path} would overwrite what is scored: give the name of another file.")
+        raise UserError(f"output = {path} would overwrite its own input: give the name of another file.")
     if path.is_dir():
         raise UserError(f"output = {path} is a folder: give the name of a file.")
     parent = path.absolute().parent

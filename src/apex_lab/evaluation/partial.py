@@ -49,7 +49,7 @@ class Parts:
     """Predictions in a folder, in the order of the split; a part is there wholly or not at all.
 
     Args:
-        folder: of this evaluation alone: its name holds what is evaluated and how.
+        folder: of this evaluation alone: its name holds the key of the evaluation.
         interval: videos per part.
     """
 

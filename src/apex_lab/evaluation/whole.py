@@ -23,7 +23,7 @@ class Asked:
 
     Attributes:
         folder: where results go.
-        split: name of what is scored.
+        split: its name.
         about: entries to be stored with the split (checkpoint, seed, ...).
         settings: entries to be stored among its settings.
         beside: entries to be stored at the top of metrics.json.

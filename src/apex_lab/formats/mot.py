@@ -9,7 +9,7 @@ left out where it is known.
 | MOTS | `frame id 2 height width mask` | the same, and class 10 for a region to ignore |
 
 The id of a prediction is its identity + 1, that of a true object its label, as in `python -m sims.p2d export --format
-mot`. Classes are those of pedestrians, 1 and 2, since evaluation kits for pedestrians pass over all others. Masks are
+mot`. Classes are those of pedestrians, 1 and 2, since evaluation kits for pedestrians ignore all others. Masks are
 in COCO's run-length encoding. Visibility is the share of the object that is seen, 1 where that is not known. A region
 to ignore keeps its label as its id where it is above 0; else its id is 10000.
 

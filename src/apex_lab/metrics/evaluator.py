@@ -59,7 +59,7 @@ class Evaluator:
             name: unique among the videos.
             prediction: identity of the winning component at every pixel, 0 <= identity <= 2^53.
             truth: true labels, >= 0, or `EvaluatorSettings.ignore_label`; 0 is the background.
-            metadata: what is known of the true objects, for the results per object.
+            metadata: of the true objects, for the results per object.
             background_ids: which identities are the model's background; needed with `drop_background_slot` alone.
 
         Raises:

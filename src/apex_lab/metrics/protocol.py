@@ -141,8 +141,8 @@ total the mean over the objects of all videos. In small images F depends strongl
 region, no mask, no volume and no boundary, whatever is predicted there. Areas (`min_pixels`, weights of `sc`) are
 those of the pixels that are left. A frame without any other pixel is left out of the means. In files, the label is
 the value in the truth file: an index of a PNG, a value of `V__gt`, an id of MOTS text, a `track_id` of COCO. Truth
-that has 255 (or 65535) without numbering its objects that far, a class 10 in MOTS text or an `iscrowd` annotation gets a
-warning where the key is absent.
+that has 255 (or 65535) without numbering its objects that far, a class 10 in MOTS text or an `iscrowd` annotation gets
+a warning where the key is absent.
 
 ## 6. Files
 Frames of image folders are found by the number in their names, videos listed in natural order (v2 before v10).

@@ -35,7 +35,7 @@ def scene_identities(
             reconstruction=scene.reconstruction.new_zeros(()).expand(*scene.reconstruction.shape[:3], *size),
             means=None,
         )
-    # Scene.segmentation passes over components without identity; that they had nothing to win is checked here.
+    # Scene.segmentation ignores components without identity; that they had nothing to win is checked here.
     winner = scene.masks.float().argmax(dim=2)
     nameless = scene.ids.gather(2, winner.flatten(2)) == ABSENT
     if bool(nameless.any()):

@@ -101,7 +101,7 @@ def main() -> None:
 
 
 def check_tables(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str]) -> Tables:
-    """Checks what is asked for.
+    """Checks the command.
 
     Raises:
         UserError: unknown key, impossible value, unknown table or model; one sentence.

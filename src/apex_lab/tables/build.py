@@ -52,10 +52,10 @@ def build(
     """Fills a table, and its variant if it has one.
 
     Args:
-        table: what is wanted.
+        table: its specification.
         specification: where it comes from.
         choices: (model, ablation) -> the runs of the row.
-        options: what is asked for.
+        options: of the command.
     """
     built = [_build(table, specification, choices, options)]
     if table.variant is not None:

@@ -138,7 +138,7 @@ def choose(
 
 
 def command_words(model: str, ablation: str | None, data: str, scale: str) -> list[str]:
-    """The words after `python -m apex_lab.train` that choose what is run."""
+    """The words after `python -m apex_lab.train` that choose a run."""
     return [
         f"model={model}",
         *([f"+ablation={ablation}"] if ablation else []),

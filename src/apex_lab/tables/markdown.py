@@ -15,7 +15,7 @@ ARROWS = {"up": "↑", "down": "↓", None: ""}
 
 
 def document(tables: Sequence[Built], published: bool, commands: Sequence[Command], problems: Sequence[str]) -> str:
-    """All tables, the commands for what is missing, and files that belong to no row.
+    """All tables, the commands of missing runs, and files that belong to no row.
 
     Args:
         tables: in their order.

@@ -83,7 +83,7 @@ class Line:
 
     Attributes:
         row: its specification.
-        label, latex: what it is called, without an asterisk.
+        label, latex: its name, without an asterisk.
         asterisk: whether a footnote marked * belongs to it.
         tracking: whether its components keep identities.
         group: folder of its runs, None where there are none.
@@ -143,9 +143,9 @@ def make_line(
         row: which.
         candidate: whether its section competes for bold.
         table: where it stands.
-        specification: what it is called.
+        specification: of the table.
         choice: its runs.
-        options: what is asked for.
+        options: of the command.
     """
     group, model = choice.group, specification.models[row.model]
     trained = group.runs if group else {}

@@ -1,4 +1,4 @@
-"""Muon, with Adam for what is no matrix: for runs of some thousand steps, such as `scale=cpu`.
+"""Muon, with Adam for all but matrices: for runs of some thousand steps, such as `scale=cpu`.
 
 PyTorch's Muon takes 2-dimensional weights alone and computes in bfloat16, which CPUs without it emulate; this one takes
 convolutions too, computes in the weights' own precision, and is one optimiser with one state.

@@ -59,7 +59,7 @@ class WeightUpdate(nn.Module):
     """One weight update of a model.
 
     Args:
-        model: what is trained.
+        model: trained in place.
         schedules: the values of `Context.schedule`.
         weights: loss term -> its weight. A weight that is 0 at every step takes its term out, even where it is not
             finite.

@@ -1,4 +1,4 @@
-"""One colour per identity, and what is painted with it.
+"""One colour per identity, and overlays in it.
 
 The first six colours are Okabe and Ito's ("Color Universal Design", 2008) without black and blue; the others were
 chosen to lie far from them and from each other, for normal vision and for simulated protanopia and deuteranopia.

@@ -1,6 +1,6 @@
 """z_where: from Gaussian latents to windows, for discovery and for propagation.
 
-A *place* is what is carried from frame to frame: (logit of s_y, logit of s_x, t_y, t_x). A *window* is what spatial
+A *place* is carried from frame to frame: (logit of s_y, logit of s_x, t_y, t_x). A *window* is what spatial
 transformers take: (s_y, s_x, t_y, t_x).
 """
 

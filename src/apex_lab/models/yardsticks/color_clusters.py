@@ -27,7 +27,7 @@ SAME_COLOR = 1.0
 
 @dataclass(frozen=True)
 class _Frame:
-    """Connected regions of one frame: number of each pixel's region, and what is known of each region."""
+    """Connected regions of one frame: number of each pixel's region, and properties of each region."""
 
     region: Int[np.ndarray, "H W"]
     cluster: Int[np.ndarray, " R"]
