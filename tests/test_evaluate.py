@@ -49,7 +49,7 @@ def test_a_checkpoint_alone_is_enough(trained: Path, command: Callable[..., Ende
     torch.save(content, tmp_path / "other.ckpt")
     ended = command("evaluate", "checkpoint=other.ckpt")
     assert ended.code == 1
-    assert "The weights in other.ckpt do not fit its model:" in ended.err
+    assert "other.ckpt: The weights do not fit their model:" in ended.err
     content["config"]["model"]["depth"] = 5
     torch.save(content, tmp_path / "other.ckpt")
     refused(command("evaluate", "checkpoint=other.ckpt"), "was made by another version of apex_lab: Unknown key")

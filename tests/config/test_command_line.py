@@ -116,7 +116,6 @@ def test_values_that_apex_cannot_be_trained_with(
     refused(command("train", *APEX, word, *steps), told, tmp_path)
 
 
-@pytest.mark.xfail(reason="conf/model/apex.yaml: the background takes its size from the data", raises=AssertionError)
 def test_apex_may_be_built_for_another_size_than_the_data_have(
     command: Callable[..., Ended], the_run: Callable[..., Path]
 ) -> None:

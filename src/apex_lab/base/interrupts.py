@@ -29,6 +29,12 @@ class Deferred:
     def __init__(self) -> None:
         self.signum: int | None = None
 
+    def listen(self) -> None:
+        """Takes the signals again, after another library has put its own handlers in place."""
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                signal.signal(number, self.receive)
+
     def act(self) -> None:
         """Stops now, if that was asked for.
 

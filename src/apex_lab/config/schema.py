@@ -195,7 +195,7 @@ def check_job(
     _check_components(config)
     _check_objective(config)
     _check_splits(config)
-    device(config.trainer.accelerator)
+    _check_cuda_graph(config.trainer)
     return Job(config, raw, dict(choices), tuple(overrides))
 
 
@@ -276,6 +276,16 @@ def _check_recipe(config: Config, choices: Mapping[str, str]) -> None:
         there = sorted(path.stem for path in (conf_dir() / "recipe" / model).glob("*.yaml"))
         known = f": choose scale={' or '.join(there)}" if there else ""
         raise UserError(f"model={model} has no recipe conf/recipe/{model}/{scale}.yaml{known}.")
+
+
+def _check_cuda_graph(trainer: TrainerPart) -> None:
+    """A step can be captured on one GPU alone."""
+    kind = device(trainer.accelerator).type
+    if trainer.cuda_graph and (kind != "cuda" or trainer.devices * trainer.num_nodes > 1):
+        raise UserError(
+            f"trainer.cuda_graph = true needs one CUDA device, and this is {trainer.devices} x {kind}: "
+            "set trainer.cuda_graph=false."
+        )
 
 
 def _check_components(config: Config) -> None:

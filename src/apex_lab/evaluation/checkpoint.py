@@ -28,6 +28,7 @@ from apex_lab.evaluation.partial import Parts
 from apex_lab.evaluation.results import summary
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.evaluation.whole import Asked, evaluate
+from apex_lab.inference.loading import trained_model
 from apex_lab.inference.predictor import Predictor
 from apex_lab.metrics.evaluator import versions
 from apex_lab.runs import checkpoints, provenance
@@ -112,7 +113,10 @@ def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
         UserError: the checkpoint does not fit, or another process works on it.
     """
     content, job = load(file, request.paths, request.data)
-    model = _model(file, content, job)
+    try:
+        model = trained_model(content["inference"])
+    except UserError as error:
+        raise UserError(sentence(f"{file}: {one_line(error)}")) from error
     with open(file, "rb") as opened:
         digest = hashlib.file_digest(opened, "sha256").hexdigest()
     folder = make_folder(_folder(request, file, content, job, model, digest, alone))
@@ -249,15 +253,6 @@ def _parts(request: Request, folder: Path, key: str) -> Parts:
         if request.again or other != own:
             shutil.rmtree(other)
     return Parts(own, request.save_interval)
-
-
-def _model(file: Path, content: Mapping[str, Any], job: config.Job) -> SceneModel:
-    model = config.build_model(job.config)
-    try:
-        model.load_state_dict(content["inference"]["weights"])
-    except RuntimeError as error:
-        raise UserError(sentence(f"The weights in {file} do not fit its model: {one_line(error)}")) from error
-    return model
 
 
 def _matches(pattern: str) -> list[Path]:

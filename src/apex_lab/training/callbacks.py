@@ -59,6 +59,7 @@ class Checkpoints(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         self._start = time.monotonic()
+        self._deferred.listen()  # Lightning has its own handler of SIGTERM, which ends a run without storing its step
         for callback in _others(trainer, self):
             if callback.state_key in self._states:
                 callback.load_state_dict(self._states[callback.state_key])

@@ -1,6 +1,6 @@
 """Several processes that train one model: Lightning's DDP, with the run folder in the hands of rank 0.
 
-On one machine rank 0 starts the others itself. Under torchrun or Slurm they are started from outside, and the
+On one machine rank 0 starts the others itself. Under torchrun they are started from outside, and the
 environment gives each its rank. Only rank 0 takes the run's lock and writes files.
 """
 
@@ -69,8 +69,8 @@ def started(job: dict[str, Any], devices: int, nodes: int, folder: Path) -> Iter
         return
     if nodes > 1:
         raise UserError(
-            f"trainer.num_nodes = {nodes} needs a launcher that starts one process per device, such as torchrun: "
-            "see docs/clusters.md."
+            f"trainer.num_nodes = {nodes} needs a launcher that starts one process per device, such as torchrun, "
+            "on every node."
         )
     if devices == 1:
         yield Ranks()

@@ -1,0 +1,139 @@
+"""Two processes that share each batch train what one process trains, leave one run folder, and resume as one does."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from apex_lab.base.errors import UserError
+from apex_lab.training.ranks import Ranks, given, started
+from tests.conftest import REPOSITORY, TINY
+
+WORDS = (*TINY, "trainer.max_steps=20", "trainer.log_interval=1", "trainer.validation_interval=10")
+
+
+def start(folder: Path, *words: str, pause: float = 0.0) -> subprocess.Popen[str]:
+    environment = {**os.environ, "PYTHONPATH": f"{REPOSITORY}", "OMP_NUM_THREADS": "1", "TINY_PAUSE": str(pause)}
+    program = (sys.executable, "-m", "apex_lab.train", *WORDS, *words)
+    return subprocess.Popen(
+        program, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    [path] = folder.glob("*/seed_0/curves.csv")
+    with open(path, newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    [path] = folder.glob("*/seed_0/checkpoints/last.ckpt")
+    return torch.load(path, weights_only=True)["inference"]["weights"]
+
+
+@pytest.fixture(scope="module")
+def one_process(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("one")
+    process = start(folder)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    return folder / "outputs"
+
+
+def equal(ours: Path, theirs: Path) -> None:
+    """Losses of all steps and validation scores agree to rounding, and so do the weights."""
+    assert len(rows(ours)) == len(rows(theirs)) == 20
+    for a, b in zip(rows(ours), rows(theirs), strict=True):
+        assert a["step"] == b["step"]
+        for name in ("train/loss", "train/gradient_norm", "val/loss", "val/ari_fg", "val/msc"):
+            assert (a[name] == "") == (b[name] == ""), (a["step"], name)
+            if a[name]:
+                assert float(a[name]) == pytest.approx(float(b[name]), rel=1e-4), (a["step"], name)
+    for name, weight in weights(theirs).items():
+        torch.testing.assert_close(weights(ours)[name], weight, rtol=1e-3, atol=1e-5)
+
+
+def test_two_processes_train_what_one_trains(one_process: Path, tmp_path: Path) -> None:
+    process = start(tmp_path, "trainer.devices=2")
+    out, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    assert errors == ""
+    assert out.count("validation:") == 2
+    equal(tmp_path / "outputs", one_process)
+    # the number of processes does not change the name of a run
+    assert [path.name for path in (tmp_path / "outputs").iterdir()] == [path.name for path in one_process.iterdir()]
+
+
+@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM])
+def test_killed_and_resumed_they_end_as_unbroken(one_process: Path, tmp_path: Path, kill: signal.Signals) -> None:
+    process = start(tmp_path, "trainer.devices=2", pause=0.2)
+    for _ in range(2000):
+        records = [json.loads(path.read_text()) for path in tmp_path.glob("outputs/*/seed_0/run.json")]
+        if records and records[0]["steps"] >= 4:
+            break
+        time.sleep(0.05)
+        assert process.poll() is None, process.communicate()[1]
+    process.send_signal(kill)
+    process.communicate(timeout=60)
+    assert process.returncode == (-9 if kill == signal.SIGKILL else 143)
+    [record] = [json.loads(path.read_text()) for path in tmp_path.glob("outputs/*/seed_0/run.json")]
+    assert 4 <= record["steps"] < 20
+    assert record["outcome"] == (None if kill == signal.SIGKILL else "interrupted")
+    for _ in range(200):  # the other process ends with the one that started it
+        if not _workers(tmp_path):
+            break
+        time.sleep(0.05)
+    assert not _workers(tmp_path)
+    process = start(tmp_path, "trainer.devices=2")
+    out, errors = process.communicate(timeout=200)
+    assert process.returncode == 0, errors
+    assert "resuming from step" in out
+    equal(tmp_path / "outputs", one_process)
+
+
+def _workers(folder: Path) -> list[str]:
+    """Processes of other ranks that were started in a folder."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            if b"apex_lab.training.worker" in (path / "cmdline").read_bytes() and os.readlink(path / "cwd") == str(
+                folder
+            ):
+                found.append(path.name)
+        except OSError:
+            continue
+    return found
+
+
+def test_a_batch_that_cannot_be_shared_is_refused(tmp_path: Path) -> None:
+    process = start(tmp_path, "trainer.devices=3")
+    _, errors = process.communicate(timeout=100)
+    assert process.returncode == 2
+    assert "clips.batch_size = 2 is the global batch, which 3 processes" in errors
+    assert not list(tmp_path.glob("outputs/*"))
+
+
+def test_a_launcher_says_which_rank_this_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    assert given() is None
+    monkeypatch.setenv("RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "4")
+    assert given() == Ranks(0, 4)
+    with started({"step": 3}, devices=2, nodes=2, folder=tmp_path) as mine:
+        assert mine == Ranks(0, 4)
+        [file] = tmp_path.glob(".job_*.pt")
+        assert torch.load(file, weights_only=True) == {"step": 3}
+    assert not list(tmp_path.glob(".job_*.pt"))
+
+
+def test_several_nodes_need_a_launcher(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"trainer\.num_nodes = 2 needs a launcher"), started({}, 1, 2, tmp_path):
+        pass
