@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 import torch
 from torch.overrides import TorchFunctionMode
-from torch.profiler import record_function
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from apex_lab import bench
@@ -25,7 +24,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.benchmark import child, compare
 from apex_lab.benchmark import rows as report
 from apex_lab.benchmark.measure import Case, measure
-from apex_lab.benchmark.profile import seconds_by_part
+from apex_lab.benchmark.profile import REST, seconds_by_part
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.schema import check_job
 from apex_lab.training.optimizers import Muon
@@ -149,15 +148,13 @@ import json, sys
 import torch
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.schema import check_job
-from apex_lab.inference.sizes import as_float
 from apex_lab.nn.noise import RankNoise
 from apex_lab.scene import Context
-job = check_job(json.load(sys.stdin), {}, needs_recipe=False)
-work = Workload(job.config, torch.device("cpu"), 1, 2)
+work = Workload(check_job(json.load(sys.stdin), {}, needs_recipe=False).config, torch.device("cpu"), 1, 2)
 work.model.train()
 forward = torch.compile(work.model.forward, backend="eager", fullgraph=True)  # raises where a graph would break
 context = Context(work.update.schedules.tensors(), RankNoise(1, 0, 1))
-loss = work.update.objective(forward(as_float(work.video), context).terms)
+loss = work.update.objective(forward(work.video.float() / 255, context).terms)
 loss.backward()
 assert loss.isfinite()
 """
@@ -180,7 +177,8 @@ def test_the_training_step_is_one_graph(words: tuple[str, ...], tmp_path: Path) 
     assert process.returncode == 0, process.stderr
 
 
-PARTS = {"encoder", "discovery", "loop over time", "propagation", "rendering", "likelihood", "rest"}
+INSIDE = {"forward", "encoder", "discovery", "loop over time", "propagation", "rendering", "likelihood", REST}
+"""Parts of a step of APEX that are there in inference too."""
 
 
 def test_the_parts_are_all_there_and_add_up() -> None:
@@ -198,27 +196,25 @@ def test_the_parts_are_all_there_and_add_up() -> None:
         began = time.perf_counter()
         seconds = seconds_by_part(watched, HERE)
         passed = time.perf_counter() - began
-        assert set(seconds) == PARTS | ({"forward", "backward", "update"} if training else set())
+        assert set(seconds) == (INSIDE | {"backward", "update"} if training else INSIDE - {"forward"})
         assert all(value > 0 for value in seconds.values())
         assert 0.99 * inside[0] < sum(seconds.values()) <= passed  # the rest is setting up the profiler
 
 
 def test_a_part_s_time_is_without_the_parts_inside_it() -> None:
     def step() -> None:
-        time.sleep(0.02)
-        for _ in range(2):
-            with record_function("outer"):
-                time.sleep(0.04)
-                with record_function("inner"):
-                    time.sleep(0.08)
-                    torch.ones(3).add(1)
-                with record_function("outer"):
-                    time.sleep(0.01)
+        with torch.profiler.record_function("outer"):
+            time.sleep(0.1)
+            with torch.profiler.record_function("inner"):
+                time.sleep(0.2)
+            with torch.profiler.record_function("inner"):
+                time.sleep(0.1)
+        time.sleep(0.2)
 
     seconds = seconds_by_part(step, HERE)
-    assert set(seconds) == {"rest", "outer", "inner"}
-    for name, least in (("rest", 0.02), ("outer", 0.1), ("inner", 0.16)):
-        assert least <= seconds[name] < least + 0.06, seconds
+    assert seconds.keys() == {"outer", "inner", REST}
+    for name, slept in (("outer", 0.1), ("inner", 0.3), (REST, 0.2)):
+        assert slept <= seconds[name] < slept + 0.1, name
 
 
 def test_writes_a_file_with_every_row(

@@ -64,7 +64,7 @@ OF_CHECKPOINTS: dict[str, Any] = {
     "chunk": None,
 }
 OF_PREDICTIONS = {"format": None, "truth": None, "partial": False, "resize": None, "output": None}
-"""Keys that mean something for one kind of evaluation alone, and what they say where nobody asks."""
+"""Keys of one kind of evaluation alone, with their defaults."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def title(job: Job) -> str:
 
 
 def train(job: Job) -> None:
-    """Brings a run to its end: says so if it is finished, resumes where it stopped, or starts it.
+    """Starts a run, resumes it where it stopped, or shows the scores of a finished one.
 
     Raises:
         UserError: the run cannot be done as asked; one sentence.
@@ -169,7 +169,7 @@ def _evaluate(run: Run, model: SceneModel, source: VideoSource, device: torch.de
 
 
 def _show(run: Run) -> None:
-    """The rows of scores and the pictures' paths."""
+    """Prints the rows of scores and the paths of drawings."""
     for split, scored in read_json(run.metrics_file)["splits"].items():
         console.say(evaluation.summary(split, scored["total"]))
     pictures = [path for path in run.view_folder.glob("*") if path.is_file()]

@@ -43,7 +43,7 @@ def test_every_choice(group: str) -> None:
 
 def test_a_scale_is_the_size_that_it_says() -> None:
     paper = compose_job("scale=paper", "data=p2d", "model=apex").config
-    assert (paper.data["image_size"], paper.data["frames"], paper.data["batch_size"]) == (128, 20, 4)
+    assert (paper.data["image_size"], paper.data["frames"], paper.clips.batch_size) == (128, 20, 4)
     assert (paper.data["train"], paper.data["val"], paper.data["test"]) == (2000, 200, 200)
     assert paper.trainer.max_steps == 40000
     cpu = compose_job("scale=cpu", "data=p2d", "model=apex").config

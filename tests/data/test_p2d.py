@@ -37,8 +37,8 @@ def test_items_are_the_simulated_videos(root: Path):
     for index in range(6):
         expected = simulate(SETTINGS, "train", index)
         item = data[index]
-        assert sorted(item) == ["index", "segmentation", "video"]
-        assert item["index"] == index
+        assert sorted(item) == ["index", "name", "segmentation", "video"]
+        assert (item["index"], item["name"]) == (index, f"train_{index:05d}")
         assert item["video"].shape == (5, 3, 16, 16)
         assert item["video"].dtype == item["segmentation"].dtype == torch.uint8
         assert item["video"].is_contiguous()
@@ -84,7 +84,7 @@ def test_positions_count_from_both_ends_and_stop(root: Path):
     data = P2D(root, "train")
     assert data[-1]["index"] == 5
     for index in (6, -7):
-        with pytest.raises(IndexError, match="which has 6"):
+        with pytest.raises(IndexError, match="has 6"):
             data[index]
         with pytest.raises(IndexError):
             data.meta(index)

@@ -30,8 +30,9 @@ def make_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
     def make(seed: int = 0, step: int = 6, name: str = "last", folder: str = "outputs/tiny_squares") -> Path:
         run = Path(folder) / f"seed_{seed}"
         (run / "checkpoints").mkdir(parents=True, exist_ok=True)
-        weights = build_model(job.config.model_copy(update={"seed": seed})).state_dict()
-        made = {"step": step, "weights": weights, "training": None, "choices": job.choices}
+        config = job.config.model_copy(update={"seed": seed})
+        inference = checkpoints.inference_part(config, build_model(config), step)
+        made = {"step": step, "inference": inference, "training": None, "choices": job.choices}
         made["config"] = {**job.raw, "seed": seed}
         checkpoints.save(run / "checkpoints" / f"{name}.ckpt", made)
         write_json(run / "run.json", {"status": "finished", "seed": seed})
@@ -49,6 +50,7 @@ def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     for key in ("defaults", "hydra"):
         del usual[key]
     usual["paths"] = {"outputs": "outputs", "data": "data"}
+    usual["batch_size"] = 2
 
     def run(*words: str) -> Ended:
         asked = OmegaConf.merge(usual, OmegaConf.from_dotlist(list(words)))

@@ -12,10 +12,11 @@ import pytest
 from filelock import FileLock
 
 from apex_lab.base.interrupts import Interrupted
-from apex_lab.evaluation import EXPORTS, Predictor, export_path
+from apex_lab.evaluation import EXPORTS, export_path
+from apex_lab.inference.predictor import Predictor
 from apex_lab.metrics import KEYS
 from tests.evaluation.conftest import Ask, Make
-from tests.tiny import Layers, SquaresModule
+from tests.tiny import Layers, SquaresSource
 
 
 def stored(folder: Path) -> dict[str, Any]:
@@ -34,9 +35,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     batches: list[int] = []
     plain = Predictor.__call__
 
-    def counted(self: Predictor, batch: dict[str, Any]) -> Any:
+    def counted(self: Predictor, batch: dict[str, Any], detail: bool = False) -> Any:
         batches.append(len(batch["index"]))
-        return plain(self, batch)
+        return plain(self, batch, detail)
 
     monkeypatch.setattr(Predictor, "__call__", counted)
     return batches
@@ -55,7 +56,8 @@ def test_everything_is_stored(make_run: Make, ask: Ask) -> None:
     assert test["settings"]["scoring"]["tracking"]["first_frame"] == 0
     assert (test["settings"]["scoring"]["min_presence"], test["settings"]["scoring"]["presence_after"]) == (0.5, False)
     assert test["versions"] == content["versions"]
-    assert test["data_fingerprint"] == SquaresModule(test=5).fingerprint
+    assert test["data_fingerprint"] == test["data"]["fingerprint"] == SquaresSource(test=5).fingerprint
+    assert test["labelled"] is True
     assert {row["property"] for row in test["by_property"]} == {"size"}
     with open(run / "per_video_test.csv", newline="") as file:
         rows = list(csv.DictReader(file))
@@ -144,7 +146,7 @@ def test_one_that_fails_does_not_stop_the_others(make_run: Make, ask: Ask) -> No
     assert not (runs[0] / "metrics.json").exists()
 
 
-def test_killed_in_the_middle_it_goes_on(
+def test_killed_in_the_middle_it_resumes(
     make_run: Make, ask: Ask, asked: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run, words = make_run(), ("pictures=0", "save_interval=2", "export=npz")
@@ -154,10 +156,10 @@ def test_killed_in_the_middle_it_goes_on(
     asked.clear()
     plain = Predictor.__call__
 
-    def killed(self: Predictor, batch: dict[str, Any]) -> Any:
+    def killed(self: Predictor, batch: dict[str, Any], detail: bool = False) -> Any:
         if len(asked) == 1:
             raise Interrupted(15)
-        return plain(self, batch)
+        return plain(self, batch, detail)
 
     with monkeypatch.context() as patch:
         patch.setattr(Predictor, "__call__", killed)
@@ -182,10 +184,10 @@ def test_what_was_begun_otherwise_is_not_mixed_in(
     plain = Predictor.__call__
     with monkeypatch.context() as patch:
 
-        def killed(self: Predictor, batch: dict[str, Any]) -> Any:
+        def killed(self: Predictor, batch: dict[str, Any], detail: bool = False) -> Any:
             if len(asked) == 2:
                 raise Interrupted(15)
-            return plain(self, batch)
+            return plain(self, batch, detail)
 
         patch.setattr(Predictor, "__call__", killed)
         assert ask(f"checkpoint={run}", *words).code == 128 + 15
@@ -314,7 +316,7 @@ def test_a_posterior_is_asked_of_models_that_have_one_alone(
     assert f"scoring.masks = posterior goes with mixture likelihoods alone: leave out {files}." in ended.err
     assert not (run / "evaluate").exists()
     monkeypatch.setattr(Layers, "has_posterior", True)
-    monkeypatch.setattr(Layers, "posterior", lambda self, scene, video, schedule: scene.masks.flip(2))
+    monkeypatch.setattr(Layers, "posterior", lambda self, scene, video, context: scene.masks.flip(2))
     assert ask(f"checkpoint={run}", "pictures=0").code == 0
     assert ask(f"checkpoint={run}", "pictures=0", "scoring.masks=posterior").code == 0
     (folder,) = (run / "evaluate").glob("last_test_*")

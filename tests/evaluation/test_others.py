@@ -128,4 +128,4 @@ def test_a_place_that_cannot_be_written_is_told_before_any_work(
     monkeypatch.setattr("os.access", lambda *_: False)
     ended = ask(f"predictions={public}")
     assert ended.code == 2
-    assert "say where they go with output=FILE.json" in ended.err
+    assert "choose another file with output=FILE.json" in ended.err

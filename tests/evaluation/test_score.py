@@ -8,7 +8,6 @@ import pickle
 import re
 import weakref
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,11 +18,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
 from apex_lab.base.errors import UserError
-from apex_lab.evaluation import Parts, Predictor, ScoringPart, Tally, score, summary
+from apex_lab.evaluation import Parts, Predicted, ScoringPart, score, summary
 from apex_lab.evaluation.pictures import choose
+from apex_lab.inference.predictor import Predictor
 from apex_lab.metrics import EvaluatorSettings
+from apex_lab.metrics.objects import ObjectMetadata, p2d_metadata
 from apex_lab.metrics.page import page
-from apex_lab.scene import Scene, Schedule
+from apex_lab.scene import Context, Scene
 from tests.conftest import REPOSITORY
 from tests.tiny import Layers, Squares
 
@@ -38,30 +39,28 @@ class Watched(Layers):
         self.answers: list[weakref.ref[Scene]] = []
         self.alive: list[int] = []
 
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
         self.alive.append(sum(answer() is not None for answer in self.answers))
-        scene = super().forward(video, schedule)
+        scene = super().forward(video, context)
         self.answers.append(weakref.ref(scene))
         return scene
 
 
 def test_memory_does_not_grow_with_videos() -> None:
     model = Watched()
-    loader = DataLoader(Squares(24, 3, 32, 0), batch_size=2)
-    tally = score(Predictor(model, {}, CPU), loader, "test", ScoringPart())
+    loader = DataLoader(Squares("test", 24, 3, 32, 0), batch_size=2)
+    tally = score(Predictor(model, {}, CPU), loader, ScoringPart())
     assert len(tally) == 24
     assert max(model.alive) <= 1
-    assert not tally.identities
     assert len(pickle.dumps(tally)) / 24 < 10_000
 
 
 def test_batch_size_and_order_change_no_digit() -> None:
     predictor = Predictor(Layers(), {}, CPU)
-    data = Squares(6, 3, 32, 0)
+    data = Squares("test", 6, 3, 32, 0)
     mixed = DataLoader(Subset(data, [3, 1, 5, 0, 4, 2]), batch_size=4)
     found = [
-        score(predictor, loader, "test", ScoringPart()).evaluator.result()
-        for loader in (DataLoader(data, batch_size=1), mixed)
+        score(predictor, loader, ScoringPart()).evaluator.result() for loader in (DataLoader(data, batch_size=1), mixed)
     ]
     assert found[0]["total"] == pytest.approx(found[1]["total"], rel=1e-12, nan_ok=True)
     assert [row["video"] for row in found[0]["per_video"]] == [row["video"] for row in found[1]["per_video"]]
@@ -70,11 +69,11 @@ def test_batch_size_and_order_change_no_digit() -> None:
 class Labelled(Squares):
     """Squares with the labels of P2D: one object in slot 0, touched by the arm in frame 1."""
 
-    def meta(self, index: int) -> dict[str, Any]:
+    def metadata(self, video: int) -> ObjectMetadata:
         contact = np.zeros((3, 1), dtype=bool)
         contact[1] = True
         pixels = np.array([[0, 64]] * 3)
-        return {
+        meta = {
             "names": ["mug"],
             "classes": np.array([4]),
             "visible_px": pixels,
@@ -82,11 +81,12 @@ class Labelled(Squares):
             "arm_contact": contact,
             "object_contact": np.zeros((3, 1, 1), dtype=bool),
         }
+        return p2d_metadata(meta)
 
 
 def test_what_the_data_set_knows_of_objects_is_in_the_table() -> None:
-    loader = DataLoader(Subset(Labelled(3, 3, 32, 0), range(2)), batch_size=2)
-    table = score(Predictor(Layers(), {}, CPU), loader, "val", ScoringPart()).evaluator.result()["per_object"]
+    loader = DataLoader(Subset(Labelled("val", 3, 3, 32, 0), range(2)), batch_size=2)
+    table = score(Predictor(Layers(), {}, CPU), loader, ScoringPart()).evaluator.result()["per_object"]
     assert table["video"].tolist() == ["val_00000", "val_00001"]
     assert table["class"].tolist() == ["mug"] * 2
     assert table["occlusion"].tolist() == [0.5] * 2
@@ -96,22 +96,35 @@ def test_what_the_data_set_knows_of_objects_is_in_the_table() -> None:
 class Nameless(Layers):
     """Gives no identity to any component."""
 
-    def forward(self, video: Float[Tensor, "B T 3 H W"], schedule: Schedule) -> Scene:
-        scene = super().forward(video, schedule)
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
+        scene = super().forward(video, context)
         return dataclasses.replace(scene, ids=torch.full_like(scene.ids, -1))
 
 
 def test_a_model_s_malformed_output_is_refused_by_name() -> None:
-    with pytest.raises(UserError, match=r"The model's output for val_00000, val_00001 cannot be scored: 100.00% of"):
-        score(Predictor(Nameless(), {}, CPU), DataLoader(Squares(2, 3, 32, 0), batch_size=2), "val", ScoringPart())
+    with pytest.raises(UserError, match=r"The model's output for val_00000 cannot be scored: 100.00% of"):
+        score(Predictor(Nameless(), {}, CPU), DataLoader(Squares("val", 2, 3, 32, 0), batch_size=2), ScoringPart())
 
 
 def test_damaged_parts_are_told(tmp_path: Path) -> None:
     parts = Parts(tmp_path / "parts", 2)
-    parts.save(Tally.empty(EvaluatorSettings()))
-    assert len(list(parts)) == 1
-    (tmp_path / "parts" / "000000.pickle").write_bytes(b"nothing")
-    with pytest.raises(UserError, match=r"000000.pickle is damaged .* remove .*parts and run the command again"):
+    identities = np.arange(24, dtype=np.int64).reshape(2, 3, 4)
+    saved = [
+        Predicted("a", 0, identities, frozenset({0, 3}), math.nan, 1.5, {"error": 2.25}),
+        Predicted("b", 1, identities[:1] - 1, frozenset(), 0.25, 0.0),
+    ]
+    parts.save(saved)
+    for one, other in zip(parts, saved, strict=True):
+        assert np.array_equal(one.identities, other.identities)
+        assert one.share == pytest.approx(other.share, rel=0, nan_ok=True)
+        kept = ("name", "position", "backgrounds", "present", "terms")
+        assert all(getattr(one, name) == getattr(other, name) for name in kept)
+    whole = (tmp_path / "parts" / "000000.npz").read_bytes()
+    for damaged in (b"nothing", b"", whole[: len(whole) // 2], whole[:-30]):
+        (tmp_path / "parts" / "000000.npz").write_bytes(damaged)
+        with pytest.raises(UserError, match=r"000000.npz is damaged .* remove .*parts and run the command again"):
+            list(parts)
+    with pytest.raises(UserError, match=r"000000.npz is damaged .* remove .*parts and run the command again"):
         list(parts)
     parts.remove()
     assert not (tmp_path / "parts").exists()
@@ -170,13 +183,13 @@ class Mixture(Layers):
     has_posterior = True
 
     def posterior(
-        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], schedule: Schedule
+        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], context: Context
     ) -> Float[Tensor, "B T K H W"]:
         return scene.masks.roll(1, dims=2)
 
 
 def test_a_posterior_takes_the_place_of_the_masks_and_changes_nothing_else() -> None:
-    batch = next(iter(DataLoader(Squares(2, 3, 32, 0), batch_size=2)))
+    batch = next(iter(DataLoader(Squares("val", 2, 3, 32, 0), batch_size=2)))
     model = Mixture()
     plain, shifted = (Predictor(model, {}, CPU, posterior=posterior)(batch) for posterior in (False, True))
     torch.testing.assert_close(shifted.masks, plain.masks.roll(1, dims=2))

@@ -15,6 +15,17 @@ MODELS = sorted(path.stem for path in (REPOSITORY / "conf" / "model").glob("*.ya
 WITHOUT_GRADIENT = {
     # added to all queries, it adds the same number to a token's logits of all slots
     "slot_attention": frozenset({"grouping.norm_slots.bias"}),
+    # a softmax over neighbours takes it out again
+    "gswm": frozenset({"history.interaction.logit_net.last.bias"}),
+    # biases of convolutions that batch normalisation takes out again
+    "space": frozenset(
+        f"background.{network}.0.bias"
+        for network in (
+            "component_decoder.first",
+            *(f"component_decoder.others.{i}" for i in range(3)),
+            *(f"{encoder}.convs.{i}" for encoder in ("component_encoder", "image_encoder") for i in range(4)),
+        )
+    ),
 }
 """Model -> names of weights whose gradient is zero for a reason."""
 
@@ -22,6 +33,8 @@ WITHOUT_GRADIENT = {
 SCHEDULES = {
     # objects live long enough for a gradient to pass through the recurrence of propagation
     "apex": {"carry": 1.0, "discover": 1.0},
+    # the foreground takes part
+    "gswm": {"background_only": 0.0},
 }
 """Model -> scheduled values that the checks need."""
 

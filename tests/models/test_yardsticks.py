@@ -177,7 +177,7 @@ def test_oracle_refuses_what_it_cannot_know() -> None:
 def test_background_subtraction_carries_its_picture_in_the_checkpoint() -> None:
     video, _ = batch()
     trained, fresh = subtraction(), BackgroundSubtraction(image_size=SIZE, radius=0)
-    with pytest.raises(ValueError, match="no median picture"):
+    with pytest.raises(ValueError, match="no median image"):
         fresh(video, Context())
     file = io.BytesIO()
     torch.save(trained.state_dict(), file)

@@ -57,8 +57,7 @@ def test_relaxed_bernoulli_has_the_distribution_of_torch_s(prob: float, temperat
     """Against the closed-form cumulative distribution of samples, and against the density that torch gives."""
     torch.manual_seed(2)
     n = 100_000
-    probs = torch.full((n,), prob, dtype=torch.float64)
-    z = relaxed_bernoulli(probs, torch.tensor(temperature), Noise()).sort().values
+    z = relaxed_bernoulli(torch.full((n,), prob, dtype=torch.float64), torch.tensor(temperature), Noise()).sort().values
     # P(z <= x) = sigmoid(temperature logit(x) - logit(prob)); Kolmogorov-Smirnov at a level of 1e-4
     logit = torch.logit(torch.tensor(prob, dtype=torch.float64))
     expected = torch.sigmoid(temperature * torch.logit(z) - logit)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from apex_lab.base.errors import UserError
+from apex_lab.config.upgrades import FORMAT
 from apex_lab.runs import checkpoints
 
 
@@ -14,10 +15,22 @@ def content(step: int = 3) -> dict[str, Any]:
     generator = torch.Generator().manual_seed(step)
     return {
         "step": step,
-        "weights": {"layer.weight": torch.randn(40, 50, generator=generator)},
+        "inference": {
+            "model": {"size": 3},
+            "weights": {"layer.weight": torch.randn(40, 50, generator=generator)},
+            "schedule": {"noise": 0.5},
+            "attributes": {"tracks": True},
+            "precision": 32,
+            "seed": 0,
+        },
         "config": {"seed": 0, "model": {"size": 3}},
         "choices": {"model": "tiny"},
-        "training": {"optimizer": {"state": {0: {"step": torch.tensor(3.0)}}}, "best": None, "seconds": 1.5},
+        "training": {
+            "optimizer": {"state": {0: {"step": torch.tensor(3.0)}}},
+            "callbacks": {},
+            "best": None,
+            "seconds": 1.5,
+        },
     }
 
 
@@ -25,9 +38,11 @@ def test_what_is_saved_is_read_back_and_readable_by_weights_only(tmp_path: Path)
     path = tmp_path / "last.ckpt"
     checkpoints.save(path, content())
     loaded = checkpoints.load(path)
-    assert torch.equal(loaded["weights"]["layer.weight"], content()["weights"]["layer.weight"])
+    assert torch.equal(
+        loaded["inference"]["weights"]["layer.weight"], content()["inference"]["weights"]["layer.weight"]
+    )
     assert loaded["config"] == {"seed": 0, "model": {"size": 3}}
-    assert torch.load(path, weights_only=True)["format"] == checkpoints.FORMAT
+    assert torch.load(path, weights_only=True)["format"] == FORMAT
 
 
 def test_the_one_before_is_kept(tmp_path: Path) -> None:
@@ -53,7 +68,7 @@ def test_a_flipped_bit_in_the_weights_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "last.ckpt"
     checkpoints.save(path, content())
     whole = bytearray(path.read_bytes())
-    numbers = content()["weights"]["layer.weight"].numpy().tobytes()
+    numbers = content()["inference"]["weights"]["layer.weight"].numpy().tobytes()
     whole[whole.index(numbers[:64]) + 1000] ^= 1
     path.write_bytes(whole)
     with pytest.raises(UserError, match="is damaged"):
@@ -76,13 +91,13 @@ def test_other_people_s_checkpoints_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="is no apex_lab checkpoint"):
         checkpoints.load(path)
     torch.save({**content(), "format": 99}, path)
-    with pytest.raises(UserError, match="has format 99, this version of apex_lab reads 1"):
+    with pytest.raises(UserError, match="has format 99, this version of apex_lab reads 1, 2: use the"):
         checkpoints.load(path)
 
 
 def test_weights_of_a_diverged_run_are_refused(tmp_path: Path) -> None:
     sick = content()
-    sick["weights"]["layer.weight"][3, 4] = float("nan")
+    sick["inference"]["weights"]["layer.weight"][3, 4] = float("nan")
     checkpoints.save(tmp_path / "last.ckpt", sick)
     with pytest.raises(UserError, match="weights that are not finite"):
         checkpoints.load(tmp_path / "last.ckpt")
@@ -94,7 +109,8 @@ def test_code_in_a_checkpoint_is_not_run(tmp_path: Path) -> None:
             return (Path.touch, (tmp_path / "touched",))
 
     path = tmp_path / "evil.ckpt"
-    torch.save({**content(), "format": 1, "weights": Evil()}, path)
+    inference = {**content()["inference"], "weights": Evil()}
+    torch.save({**content(), "format": FORMAT, "inference": inference}, path)
     with pytest.raises(UserError, match="is damaged or no checkpoint"):
         checkpoints.load(path)
     assert not (tmp_path / "touched").exists()

@@ -8,7 +8,8 @@ import pytest
 import torch
 
 from apex_lab.config.schema import Job
-from apex_lab.runs.folder import HARMLESS, Run, fingerprint, group_name, run_folder
+from apex_lab.config.upgrades import EXCLUDED, fingerprint
+from apex_lab.runs.folder import Run, group_name, run_folder
 from tests.conftest import compose_job
 
 
@@ -28,13 +29,22 @@ def changed(raw: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
     return raw
 
 
-@pytest.mark.parametrize("key", HARMLESS)
-def test_harmless_keys_keep_the_fingerprint(key: str, job: Job) -> None:
+@pytest.mark.parametrize("key", EXCLUDED)
+def test_excluded_keys_keep_the_fingerprint(key: str, job: Job) -> None:
     assert fingerprint(changed(job.raw, key, "else")) == fingerprint(job.raw)
 
 
 @pytest.mark.parametrize(
-    "key", ["trainer.max_steps", "trainer.precision", "data.frames", "model.components", "optimizer.lr", "loss.error"]
+    "key",
+    [
+        "trainer.max_steps",
+        "trainer.precision",
+        "data.frames",
+        "clips.batch_size",
+        "model.components",
+        "optimizer.lr",
+        "loss.error",
+    ],
 )
 def test_all_others_change_it(key: str, job: Job) -> None:
     assert fingerprint(changed(job.raw, key, 77)) != fingerprint(job.raw)

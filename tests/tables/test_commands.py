@@ -81,7 +81,7 @@ def test_another_configuration_is_told(tmp_path: Path) -> None:
     run_folder(tmp_path, "apex", 0, hash8="ffffffff")
     found = of(commands(tmp_path), "APEX")
     assert found.text == "python -m apex_lab.train model=apex seed=1,2,3 scale=paper -m"
-    assert found.remarks[1] == "its other seeds have another configuration; seed=0,1,2,3 makes the whole row anew"
+    assert found.remarks[1] == "its other seeds have another configuration; seed=0,1,2,3 makes the whole row again"
 
 
 def test_changed_values_are_not_what_the_row_asks_for_unless_their_group_is(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import torch
 
 from apex_lab.base import progress
 from apex_lab.config.schema import build_model
-from apex_lab.scene import Scene, Schedule
+from apex_lab.scene import Context, Scene
 from apex_lab.training import estimate
 from tests.conftest import compose_job
 from tests.tiny import Layers
@@ -16,13 +16,13 @@ from tests.tiny import Layers
 class Slow(Layers):
     """Takes 10 ms a frame."""
 
-    def forward(self, video: torch.Tensor, schedule: Schedule) -> Scene:
+    def forward(self, video: torch.Tensor, context: Context) -> Scene:
         time.sleep(0.01 * video.shape[0] * video.shape[1])
-        return super().forward(video, schedule)
+        return super().forward(video, context)
 
 
 def test_a_step_is_scaled_up_to_the_whole() -> None:
-    config = compose_job("data.frames=20", "data.batch_size=4", "trainer.max_steps=1000").config
+    config = compose_job("data.frames=20", "clips.batch_size=4", "trainer.max_steps=1000").config
     seconds = estimate.seconds_on_cpu(config, Slow())
     assert 0.01 * 20 * 4 * 1000 < seconds < 5 * 0.01 * 20 * 4 * 1000
 

@@ -47,7 +47,7 @@ def say(message: str) -> None:
 
 
 def warn(message: str) -> None:
-    """Something was not as wished, but work goes on."""
+    """Prints a warning; work continues."""
     _LOG.warning(message)
 
 

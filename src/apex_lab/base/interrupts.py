@@ -1,4 +1,4 @@
-"""Being stopped from outside (Ctrl-C, SIGTERM) without losing work."""
+"""Interrupts (Ctrl-C, SIGTERM) without loss of work."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupted(BaseException):
-    """Somebody asked the process to stop; nothing is wrong, so nothing on the way may take it for an error."""
+    """The process was asked to stop; a BaseException, so that no handler of errors catches it."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(signal.Signals(signum).name)
@@ -58,7 +58,7 @@ def interruptible() -> Iterator[None]:
 
 @contextlib.contextmanager
 def deferring() -> Iterator[Deferred]:
-    """The first Ctrl-C or SIGTERM is only noted; whoever works here asks for it with `Deferred.act`."""
+    """The first Ctrl-C or SIGTERM is only noted; the code inside acts on it with `Deferred.act`."""
     deferred = Deferred()
     with _handled(deferred.receive):
         yield deferred

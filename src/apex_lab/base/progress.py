@@ -1,4 +1,4 @@
-"""How far long work is and how much time is left: a bar on a terminal, a line now and then elsewhere."""
+"""Progress and time left of long work: a bar on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Meter:
         self._first, self._began = done, time.monotonic()
 
     def show(self, done: int, note: str = "") -> None:
-        """Says how many are done, if it is time to."""
+        """Shows how many are done, if it is time to."""
         if self._bar is not None:
             self._bar.update(self._task, completed=done, note=note)
         elif self.due():

@@ -14,7 +14,7 @@ from apex_lab.base.errors import UserError
 
 
 def one_line(error: BaseException | str) -> str:
-    """What an exception says, on one line and without a full stop."""
+    """The message of an exception, on one line and without a full stop."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text.rstrip(".")
 

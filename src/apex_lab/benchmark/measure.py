@@ -49,7 +49,7 @@ class Case:
 
 
 def measure(case: Case) -> dict[str, Any]:
-    """What one row says; see the keys. `unavailable` holds a sentence where the case cannot be run here."""
+    """The values of one row; see the keys. `unavailable` holds a sentence where the case cannot be run here."""
     device = torch.device(case.device)
     before = peak_memory(device)
     work = Workload(case.config, device, case.batch_size, case.frames, mode=case.mode)
@@ -136,12 +136,12 @@ def kernels(step: Callable[[], object]) -> dict[str, int]:
 def peak_memory(device: torch.device) -> float | None:
     """The most memory in GiB that was held so far: by tensors on a GPU, else by this process (its resident set).
 
-    None where the system does not say.
+    None where the system does not report it.
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / GIB
     if sys.platform == "linux":
-        # not getrusage: what it says of a child begins with what the parent held when it made the child
+        # not getrusage: a child's value begins with the parent's at the time of the fork
         lines = Path("/proc/self/status").read_text().splitlines()
         return next(int(line.split()[1]) / 2**20 for line in lines if line.startswith("VmHWM:"))
     if sys.platform == "darwin":

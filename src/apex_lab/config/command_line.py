@@ -36,7 +36,7 @@ Check = Callable[[dict[str, Any], dict[str, str], Sequence[str]], Any]
 """(plain configuration, group -> word, overrides) -> a checked job; raises UserError."""
 
 CHOICES = ("model", "ablation", "data", "scale", "experiment")
-"""Groups that say what is run; a run has one choice of each."""
+"""Groups that name a run; a run has one choice of each."""
 
 CONFIG_ERROR = 2
 RUN_ERROR = 1
@@ -70,7 +70,7 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
         except UserError as error:
             console.error(str(error))
             failures.append((name, one_line(error)))
-        except Exception as error:  # noqa: BLE001 - told below; the other jobs of a sweep must still run
+        except Exception as error:  # noqa: BLE001 - reported below; the other jobs of a sweep must still run
             traceback.print_exc()
             failures.append((name, f"{type(error).__name__}: {one_line(error)}"))
 
@@ -86,7 +86,7 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
         console.error(str(error))
         sys.exit(CONFIG_ERROR)
     except Interrupted as stop:
-        console.error(f"Stopped by {stop}; the same command goes on from here.")
+        console.error(f"Stopped by {stop}; the same command resumes from here.")
         sys.exit(128 + stop.signum)
     if failures:
         if jobs > 1:
@@ -170,7 +170,7 @@ def _check_hydra_keys(name: str, extra: Sequence[str], overrides: Sequence[str])
 
 def _check_groups(command: str, overrides: Sequence[str]) -> None:
     """Refuses choices that a command does not have, and two of one thing in one run: Hydra would merge them into a run
-    that no word names.
+    that no choice names.
     """
     if command not in ("train", "bench", "evaluate"):
         return
@@ -240,7 +240,7 @@ def _options_last(arguments: Sequence[str]) -> list[str]:
 
 
 def _told(error: Exception, overrides: Sequence[str]) -> str:
-    """What Hydra or OmegaConf says in several lines, as one sentence with the key, the value and what to do."""
+    """A message of Hydra or OmegaConf of several lines, as one sentence with the key, the value and what to do."""
     text = str(error)
     given = {word.split("=", 1)[0].lstrip("+~"): word.lstrip("+~") for word in overrides}
     if isinstance(error, MissingConfigException) and error.options is not None:

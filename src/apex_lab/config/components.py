@@ -41,7 +41,7 @@ def target_of(node: Node, key: str) -> Callable[..., Any]:
     """The class or function that a node names.
 
     Raises:
-        UserError: there is no such thing.
+        UserError: there is no such class or function.
     """
     name = node["_target_"]
     if not isinstance(name, str):
@@ -166,7 +166,7 @@ def _hints(target: Callable[..., Any]) -> dict[str, Any]:
 
 
 def _check_built(value: Any, hint: Any, key: str) -> None:
-    """Whether what a nested component builds is what its place asks for, as far as both are classes."""
+    """Refuses a nested component of a class that its parameter does not allow, as far as both are classes."""
     if not is_node(value) or value.get("_partial_"):
         return
     built = target_of(value, key)
@@ -177,7 +177,7 @@ def _check_built(value: Any, hint: Any, key: str) -> None:
 
 
 def _classes(hint: Any) -> tuple[type, ...]:
-    """Classes that a type hint allows; empty where it allows what no class tells.
+    """Classes that a type hint allows; empty where classes do not decide.
 
     Any, protocols, typed dictionaries, array types and the abstract collections have metaclasses or registries of their
     own: what satisfies them need not be a subclass.

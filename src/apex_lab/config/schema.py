@@ -43,7 +43,7 @@ class _Part(BaseModel):
 
 
 class TrainerPart(_Part):
-    """How long and on what a model is trained; `steps` are weight updates.
+    """Length and device of training; `steps` are weight updates.
 
     A key that was added later has the default that stands in `apex_lab.config.upgrades.ADDED` too.
     """
@@ -171,7 +171,7 @@ def refuse_missing(raw: Mapping[str, Any], prefix: str = "") -> None:
 def check_job(
     raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str] = (), needs_recipe: bool = True
 ) -> Job:
-    """Checks everything that can be known before work starts; the first fault is told in one sentence.
+    """Checks everything that can be known before work starts; the first fault is reported in one sentence.
 
     Types and bounds of every key, components against their constructors' signatures, and whether model, schedules and
     loss belong together. Components are built once (none reads data or starts anything when built).
@@ -216,7 +216,7 @@ def build_model(config: Config) -> SceneModel:
     """The model with weights drawn from the seed alone; the caller's random state is left as it was.
 
     Raises:
-        UserError: the constructor refuses its values, or what was built is no `SceneModel`.
+        UserError: the constructor refuses its values, or it is no `SceneModel`.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
@@ -250,7 +250,7 @@ def build_weights(config: Config) -> dict[str, Callable[[int], float]]:
 
 
 def build_lr_scale(config: Config) -> Callable[[int], float]:
-    """What all learning rates are multiplied by, as a schedule."""
+    """The factor of all learning rates, as a schedule."""
     return _build_value(config.lr_scale, "lr_scale")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from torch.utils.data import DataLoader
 
 from apex_lab.base.errors import UserError
-from apex_lab.data.batches import TrainBatches
+from apex_lab.data.clips import ClipSampler
 from apex_lab.data.p2d import P2D
 
 FOREVER = 10**9
@@ -21,7 +21,8 @@ FOREVER = 10**9
 
 def frames_per_second(data: P2D, batch_size: int, workers: int, seconds: float) -> float:
     """Frames per second of whole shuffled batches, as training takes them, measured after two batches of warm-up."""
-    batches = TrainBatches(len(data), batch_size, seed=0, start_step=0, max_steps=FOREVER)
+    lengths = [data.length(video) for video in range(len(data))]
+    batches = ClipSampler(lengths, batch_size, seed=0, start=0, stop=FOREVER)
     source = iter(DataLoader(data, batch_sampler=batches, num_workers=workers))
     frames = 0
     for _ in range(2 + 2 * workers):  # what the workers have loaded ahead must not count

@@ -118,7 +118,7 @@ class P2D(VideoSet):
         return dict(self.manifest.facts["camera"])
 
     def median(self, sample: int | None = MEDIAN_SAMPLE) -> Float[Tensor, "3 H W"]:
-        """Per-pixel median image in [0, 1]: what is there when nothing stands in front of it.
+        """Per-pixel median image in [0, 1]: the static background.
 
         Args:
             sample: number of frames, evenly spaced over the split; None: all of them, which takes long.

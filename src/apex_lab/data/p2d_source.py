@@ -22,8 +22,8 @@ from sims.p2d.verify import check, is_verified, verify
 class P2DSource(VideoSource):
     """The Panda Pushing Dataset with the given settings, in a folder of its own below `root`.
 
-    The folder's name holds a fingerprint of the settings, so different data never meet; whoever wants data that are
-    there already uses them, and processes that want the same missing data make them once.
+    The folder's name holds a fingerprint of the settings, so different data never meet. Data that exist are used;
+    processes that need the same missing data make them once.
 
     Args:
         root: folder of all data sets.

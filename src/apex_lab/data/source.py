@@ -39,4 +39,4 @@ class VideoSource(ABC):
 
     @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """What a record keeps about the data: at least `name`, `fingerprint` and the settings."""
+        """The entries about the data in a run's record: at least `name`, `fingerprint` and the settings."""

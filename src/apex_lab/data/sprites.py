@@ -1,8 +1,7 @@
 """Sprites: coloured shapes that move over a plain ground, drawn when they are read, so nothing is stored.
 
 After the idea of SpMOT in Weis et al. (2020). Object-centric models are known to do well on
-such data: what fails here is a bug,
-not a hard data set.
+such data: a failure here is a bug, not a hard data set.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a data set of videos is: named items, labelled or not, read whole or as clips (design: `VideoSet`)."""
+"""Data sets of videos: named items, labelled or not, read whole or as clips."""
 
 from __future__ import annotations
 
@@ -64,18 +64,18 @@ class VideoSet(Dataset[Item], ABC):
 
     @abstractmethod
     def name(self, video: int) -> str:
-        """Unique among all sets of the data: scores, pictures, exports and evaluation noise go by it."""
+        """Unique among all sets of the data: the key of scores, drawings, exports and evaluation noise."""
 
     @abstractmethod
     def read(self, clip: Clip) -> Mapping[str, Tensor]:
         """`video` uint8 (T, 3, H, W) and, where labelled, `segmentation` uint8 (T, H, W): 0 is the background."""
 
     def metadata(self, video: int) -> ObjectMetadata | None:
-        """What is known of the objects beside their masks; None if nothing is."""
+        """Metadata of the objects; None without any."""
         return None
 
     def median(self, sample: int | None = MEDIAN_SAMPLE) -> Float[Tensor, "3 H W"]:
-        """Per-pixel median image in [0, 1]: what is there when nothing stands in front of it.
+        """Per-pixel median image in [0, 1]: the static background.
 
         Args:
             sample: number of frames, evenly spaced over the set; None: all of them, which takes long.

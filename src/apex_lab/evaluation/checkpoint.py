@@ -101,7 +101,7 @@ def load(file: Path, paths: config.PathsPart, data: OtherData | None = None) -> 
 
 
 def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
-    """Evaluates one checkpoint, or says that it was done before; prints rows and paths.
+    """Evaluates one checkpoint, or reports that it was done before; prints rows and paths.
 
     Args:
         request: what is asked for.

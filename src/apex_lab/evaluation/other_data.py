@@ -13,7 +13,7 @@ SIZES = ("frames", "image_size", "train", "val", "test")
 
 @dataclass(frozen=True)
 class OtherData:
-    """What the command line says of the data.
+    """The data settings of the command line.
 
     Attributes:
         node: the composed `data` node; without a `_target_` where no data set was chosen.

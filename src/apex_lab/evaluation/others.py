@@ -33,7 +33,7 @@ class Predictions:
 
 
 def output_of(path: Path) -> Path:
-    """Where scores go if nothing else is said: <name>.metrics.json beside the predictions."""
+    """Where scores go by default: <name>.metrics.json beside the predictions."""
     path = Path(os.path.abspath(path)) if path.name in ("", "..") else path
     return path.with_name(f"{path.name if path.is_dir() else path.stem}.metrics.json")
 
@@ -56,7 +56,7 @@ def check_output(path: Path, read: Sequence[Path | None] = ()) -> None:
     while not parent.exists():
         parent = parent.parent
     if not parent.is_dir() or not os.access(parent, os.W_OK):
-        raise UserError(f"The scores cannot be written to {path}: say where they go with output=FILE.json.")
+        raise UserError(f"The scores cannot be written to {path}: choose another file with output=FILE.json.")
 
 
 def score_others(predictions: Predictions) -> None:

@@ -1,4 +1,4 @@
-"""What is known so far of an evaluation that can be killed at any time: predictions on the disk, a few videos a file.
+"""Intermediate results of an evaluation that can be killed at any time: predictions on the disk, a few videos a file.
 
 A file holds the identity of every pixel and little else, as plain arrays; scores, which take a millisecond a video, are
 computed from them again on resumption.
@@ -24,7 +24,7 @@ from apex_lab.base.files import make_folder, replacing
 
 @dataclass(frozen=True)
 class Predicted:
-    """What a model gives for one video, as far as scores and exports need it.
+    """A model's output for one video, as far as scores and exports need it.
 
     Attributes:
         name: of the video.

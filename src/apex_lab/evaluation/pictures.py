@@ -78,7 +78,7 @@ def draw(
 
     Args:
         folder: where to.
-        chosen: the videos; `key` is the score that ranked them, which their captions tell.
+        chosen: the videos; `key` is the score that ranked them, shown in their captions.
         key: one of `apex_lab.metrics.KEYS`.
         positions: video name -> place in the data set.
         predictor: the model.

@@ -11,7 +11,7 @@ from apex_lab.metrics import EvaluatorSettings, TrackingSettings
 from apex_lab.metrics.boundary import TOLERANCE
 
 OF_SCENES = ("min_presence", "presence_after", "masks")
-"""Keys that say how a `Scene` becomes identities; files of predictions hold identities."""
+"""Keys of the way from a `Scene` to identities; files of predictions hold identities."""
 
 
 class _Part(BaseModel):
@@ -63,7 +63,7 @@ class ScoringPart(_Part):
         return self
 
     def settings(self, tracks: bool, details: bool = False) -> EvaluatorSettings:
-        """What the evaluator is built with.
+        """Settings of the evaluator.
 
         Args:
             tracks: whether identities hold over time.
@@ -81,6 +81,6 @@ class ScoringPart(_Part):
         )
 
     def stored(self, tracks: bool) -> dict[str, Any]:
-        """What is stored with the results."""
+        """The settings stored with the results."""
         of_scenes = {name: getattr(self, name) for name in OF_SCENES}
         return {**asdict(self.settings(tracks)), **of_scenes}

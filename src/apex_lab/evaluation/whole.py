@@ -19,7 +19,7 @@ from apex_lab.inference.predictor import Predictor
 
 @dataclass(frozen=True)
 class Asked:
-    """What an evaluation is to do.
+    """The request of an evaluation.
 
     Attributes:
         folder: where results go.
@@ -57,7 +57,7 @@ def evaluate(
         asked: what to do.
         predictor: the model.
         batches: of the split, in order.
-        parts: where what is done is kept until all is.
+        parts: where predictions are kept until all are made.
 
     Returns:
         What metrics.json holds of the split, and the paths of exports and pictures, film strip first among those.

@@ -7,7 +7,7 @@ are the frames of all videos in order, their ids counted from 0; `video_id` and 
 
 Predictions: a result list, one entry per mask with `image_id`, `category_id` (there is one category, "object"),
 `segmentation`, `score` (1) and `track_id`, the identity over time. The background is left out where it is known;
-`score.py` makes one segment of all pixels without a mask.
+the reader makes one segment of all pixels without a mask.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class CocoWriter:
 def read_results(
     results: Sequence[Any], path: Path, places: Places, shapes: Mapping[str, tuple[int, int, int]]
 ) -> Iterator[tuple[str, Int64[np.ndarray, "T H W"]]]:
-    """Identity maps of the videos that a result list tells of, in the order of `shapes`.
+    """Identity maps of the videos in a result list, in the order of `shapes`.
 
     Pixels of no mask form one more segment over the whole video; see `video.with_rest`.
 
@@ -137,7 +137,7 @@ def read_results(
 
 
 def videos_with_results(results: Sequence[Any], path: Path, places: Places) -> set[str]:
-    """Names of the videos that a result list tells of."""
+    """Names of the videos in a result list."""
     images = {_entry(entry, f"{path}, result {number}")[0] for number, entry in enumerate(results)}
     return {places[image][0] for image in images if image in places}
 

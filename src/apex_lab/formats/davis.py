@@ -1,10 +1,10 @@
 """Predictions as DAVIS-style PNGs: a folder per video, a palette image per frame, its index the identity.
 
 Identities are numbered 1, 2, ... per video in the order of their values; index 0 is the background where it is known.
-What identities are called does not matter to any metric, so nothing is lost. A palette has room for 254 of them: 255
+No metric depends on the values of identities, so nothing is lost. A palette has room for 254 of them: 255
 is DAVIS's mark of pixels to ignore, and in ground truth the ignored label is written so.
 
-Palette and grey images are read, of 1 to 16 bits. The number in a file's name says which frame it is.
+Palette and grey images are read, of 1 to 16 bits. The number in a file's name is its frame.
 """
 
 from __future__ import annotations

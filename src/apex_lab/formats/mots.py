@@ -67,7 +67,7 @@ def read_mots(path: str | Path, name: str, shape: tuple[int, int, int]) -> Int64
 class MotsTruth:
     """Ground truth in a folder of `V.txt` or, as the MOTChallenge lays it out, of `V/gt/gt.txt`.
 
-    Ids are the labels; pixels of no mask are background. `V/seqinfo.ini` says how long and large V is; without it the
+    Ids are the labels; pixels of no mask are background. `V/seqinfo.ini` holds length and size of V; without it the
     last mask's frame is the last one.
 
     Args:

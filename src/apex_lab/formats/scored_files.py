@@ -62,7 +62,7 @@ def score_predictions(
     Args:
         path: an npz file, a JSON file (COCO's result list, or the layout of Weis et al.), a folder with a folder of
             PNGs per video, or a folder of MOTS text files.
-        format: which of these; told by the name where missing.
+        format: which of these; inferred from the name where missing.
         truth: ground truth, see `truth.open_truth`; an npz file may hold its own.
         split: of a P2D folder of ground truth.
         partial: let ground truth have videos without a prediction.

@@ -31,7 +31,7 @@ class Truth(Protocol):
         """True labels of one video, 0 is the background."""
 
     def metadata(self, name: str) -> ObjectMetadata | None:
-        """What else is known of its objects."""
+        """Metadata of its objects."""
 
     def numbers(self, name: str) -> list[int] | None:
         """The numbers of its frames, ascending; None where frames have a place and no number."""

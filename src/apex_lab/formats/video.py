@@ -21,7 +21,7 @@ SUM_TOLERANCE = 1e-3
 
 @dataclass(frozen=True)
 class PredictedVideo:
-    """What a program says about one video.
+    """A program's predictions for one video.
 
     Attributes:
         name: of the video.
@@ -30,7 +30,7 @@ class PredictedVideo:
         masks: soft masks, sum 1 over K; None where only the winners are known.
         ids: identity of each slot, -1 for an absent one.
         background_ids: which identities are background, where that is known.
-        objects: what else is known of the true objects.
+        objects: metadata of the true objects.
     """
 
     name: str

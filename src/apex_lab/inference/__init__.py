@@ -1,1 +1,1 @@
-"""What evaluation, validation, prediction and arrangement share: a loaded model, and how it is called."""
+"""Inference that evaluation, validation and pictures share: a loaded model, and how it is called."""

@@ -48,7 +48,7 @@ def contingency(prediction: Labels, truth: Labels, ignore_label: int | None = No
     """Counts shared pixels per frame; one identity has one column over the whole video.
 
     Args:
-        prediction: predicted identities, >= 0; what they are called does not matter.
+        prediction: predicted identities, >= 0; their values do not matter.
         truth: true labels, >= 0; 0 is the background.
         ignore_label: pixels of this true label are not counted, and neither it nor an identity that only such pixels
             have gets a row or column; it may be negative.

@@ -17,7 +17,7 @@ class Key:
 
     Attributes:
         meaning: one sentence.
-        range: in words; "count" for numbers of things.
+        range: in words; "count" for counts.
         better: which direction is good; None where there is none.
         levels: where it is given: per frame, per video, in total.
     """

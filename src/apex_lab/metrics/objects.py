@@ -71,7 +71,7 @@ def object_rows(
         labels: the label of each row of it.
         metadata: class, occlusion, contact; NaN (class: None) where missing.
         boundary: J and F per object; NaN where missing.
-        frames, events: tracking; NaN where missing, which is to say that there are no identities over time.
+        frames, events: tracking; NaN where missing: there are no identities over time.
         pixels: of an image; as many as the table counts where missing.
 
     Returns:

@@ -12,7 +12,7 @@ Made by `python -m apex_lab.metrics.page > docs/metrics.md` from `apex_lab/metri
 `python -m apex_lab.evaluate checkpoint=...` stores them in `metrics.json` under `splits.<split>.total` and
 `splits.<split>.per_video`; `python -m apex_lab.evaluate predictions=...` in `<name>.metrics.json` under `total`,
 `per_video` and `per_frame`. What is undefined (a mean over nothing, tracking of a model without identities) is `null`.
-`settings` says how they were scored, `hota_alpha` holds HOTA per threshold, and `by_property` says where the model
+`settings` holds the settings of scoring, `hota_alpha` holds HOTA per threshold, and `by_property` shows where the model
 fails: mean results of true objects alike in class, size, occlusion or contact. Scores of a model of this repository
 come with `foreground_share`, the mean share of pixels that it gives to objects and not to its background.
 

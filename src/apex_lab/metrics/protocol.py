@@ -21,7 +21,7 @@ The background takes part like any other component. Files of predictions hold ma
 identities; where a format leaves pixels without a mask, these form one more segment over the whole video.
 
 All scores are functions of one table per frame: how many pixels each true label shares with each predicted identity.
-What labels and identities are called changes nothing, nor does the order of videos or the size of batches.
+Names of labels and identities, the order of videos and the batch size change nothing.
 
 ## 1. Segmentation
 ### 1.1 ARI and ARI-FG
@@ -55,7 +55,7 @@ mean over videos, each one vote.
 
 `scoring.skip_empty=true` leaves frames (for `video_…`: videos) without any visible object out of the means of ARI-FG,
 MSC-FG and SC-FG, which otherwise count them as 1, 0 and 0: it lowers the first and raises the others. `empty_frames`
-says how many there are. `mbo` and `miou` always leave them out.
+is their number. `mbo` and `miou` always leave them out.
 
 ## 2. Tracking
 MOTA to MT follow Weis et al. [4], CLEAR MOT [5] with mask IoU, computed with py-motmetrics. For every video:
@@ -67,7 +67,7 @@ MOTA to MT follow Weis et al. [4], CLEAR MOT [5] with mask IoU, computed with py
 3. **Small masks**: true and predicted masks of 5 pixels or fewer (`min_pixels`) are dropped, frame by frame.
 4. **IoU** of all true masks that are left, the background included, with all predicted masks that are left.
 5. **Background**: every predicted mask with an IoU above 0.2 (`background_iou`) with the true background is removed
-   from the frame, then the true background itself. What the model calls background plays no part in this; a segment
+   from the frame, then the true background itself. The model's own background plays no part in this; a segment
    of background with a smaller IoU stays and is a false positive. `drop_background_slot=true` removes the model's own
    background first.
 6. **Threshold**: a pair can match if its IoU is at least 0.5 (`min_iou`).
@@ -140,16 +140,16 @@ total the mean over the objects of all videos. In small images F depends strongl
 `scoring.ignore_label=255` (any number) leaves the pixels with that true label out of every score: they are in no
 region, no mask, no volume and no boundary, whatever is predicted there. Areas (`min_pixels`, weights of `sc`) are
 those of the pixels that are left. A frame without any other pixel is left out of the means. In files, the label is
-what the truth file says: an index of a PNG, a value of `V__gt`, an id of MOTS text, a `track_id` of COCO. Truth that
-has 255 (or 65535) without numbering its objects that far, a class 10 in MOTS text or an `iscrowd` annotation gets a
+the value in the truth file: an index of a PNG, a value of `V__gt`, an id of MOTS text, a `track_id` of COCO. Truth
+that has 255 (or 65535) without numbering its objects that far, a class 10 in MOTS text or an `iscrowd` annotation gets a
 warning where the key is absent.
 
 ## 6. Files
 Frames of image folders are found by the number in their names, videos listed in natural order (v2 before v10).
 Prediction and truth pair by frame number; where one side has no numbers, the other's must start at 0 or 1 and have no
-gaps. What does not pair is refused. Exports can be scored again and give the same numbers (of a model with several
-background components, `npz` and `weis` alone: the others leave the background out), and their truth files serve as
-`truth=`:
+gaps. Frames that do not pair are refused. Exports can be scored again and give the same numbers (of a model with
+several background components, `npz` and `weis` alone: the others leave the background out), and their truth files
+serve as `truth=`:
 
 | `export=` | predictions, `predictions/<split>.…` | truth | read by |
 |---|---|---|---|

@@ -18,7 +18,7 @@ def scene_identities(
     """Identity of the winning component at every pixel, in the resolution of the ground truth.
 
     Args:
-        scene: what a model says.
+        scene: a model's output.
         size: (H, W) of the ground truth; soft masks of another size are resized before the argmax
             (metrics.md section 0). None keeps the masks' own size.
         min_presence: objects below it are absent (metrics.md section 2.4).

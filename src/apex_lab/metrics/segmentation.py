@@ -1,6 +1,6 @@
 """Adjusted Rand index and segmentation covering as the paper's tables have them (metrics.md section 1).
 
-Every value is computed in float64 from integer counts. Both metrics do not care what the labels are called.
+Every value is computed in float64 from integer counts. Neither metric depends on the values of labels.
 
 * `ari`, `ari_fg`: Hubert and Arabie (1985); ARI-FG looks at the pixels of true objects alone, so a segment that
   bleeds into the background is not punished.

@@ -36,7 +36,7 @@ def mlp(sizes: Sequence[int]) -> nn.Sequential:
 class GlimpseEncoder(nn.Module):
     """CNN from a crop to a vector: strided convolutions down to 4 x 4 or less, then one linear layer.
 
-    A linear shortcut from the crop itself adds to the code, so that what a crop shows is in it from the first step on.
+    A linear shortcut from the crop itself adds to the code, so that the crop's content is in it from the first step on.
 
     Args:
         channels: of the crop.
@@ -61,15 +61,15 @@ class GlimpseEncoder(nn.Module):
 
 
 class SubpixelDecoder(nn.Module):
-    """CNN from a latent vector to a square picture: 4 x 4, then doubled by sub-pixel convolutions up to `size`.
+    """CNN from a latent vector to a square image: 4 x 4, then doubled by sub-pixel convolutions up to `size`.
 
     The last convolution is a sub-pixel one too, so nothing is computed at full size.
 
     Args:
         latent: length of the latent vector.
-        size: side of the picture in pixels, 4 times a power of two.
+        size: side of the image in pixels, 4 times a power of two.
         width: channels at half the size; each level below has twice as many, at most 4 x.
-        outputs: channels of the picture (linear).
+        outputs: channels of the image (linear).
     """
 
     def __init__(self, latent: int, size: int, width: int, outputs: int) -> None:
@@ -87,7 +87,7 @@ class SubpixelDecoder(nn.Module):
         self.largest = max(width, 4 * outputs) * (size // 2) ** 2
 
     def start_at(self, value: float) -> None:
-        """Sets the last bias, so that an untrained decoder's pictures vary around `value`."""
+        """Sets the last bias, so that an untrained decoder's images vary around `value`."""
         last = self.head[0]
         assert isinstance(last, nn.Conv2d)
         assert last.bias is not None
@@ -103,9 +103,9 @@ class BroadcastDecoder(nn.Module):
 
     Args:
         latent: length of the latent vector.
-        size: side of the picture in pixels.
+        size: side of the image in pixels.
         width: channels.
-        outputs: channels of the picture (linear).
+        outputs: channels of the image (linear).
         coarse: the grid is `size / coarse`; a power of two, at least 2.
     """
 

@@ -99,7 +99,7 @@ class Paster:
         """Every glimpse in an image of its own.
 
         Channels ride along as extra columns, then as extra rows, so each window takes two plain matrix products.
-        Between them, while they are small, they are brought in order: pictures are contiguous.
+        Between them, while they are small, they are brought in order: images are contiguous.
         """
         channels = glimpses.shape[-3]
         rows = self.w_y.transpose(-1, -2) @ glimpses.transpose(-3, -2).flatten(-2)

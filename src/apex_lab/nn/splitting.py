@@ -15,7 +15,7 @@ CACHED = 4 * 2**20
 
 
 def part_size(count: int, values_each: int, like: Tensor) -> int:
-    """How many of `count` things to work on at once: all, but on a CPU as many as make tensors of `CACHED` bytes.
+    """How many of `count` items to work on at once: all, but on a CPU as many as make tensors of `CACHED` bytes.
 
     Args:
         count: how many there are, at least 1.

@@ -1,4 +1,4 @@
-"""Checkpoint files: weights with the configuration that built the model, and what training needs to go on.
+"""Checkpoint files: weights with the configuration that built the model, and what training needs to resume.
 
 A checkpoint is a dictionary of plain values and tensors, readable with `torch.load(path, weights_only=True)`:
 

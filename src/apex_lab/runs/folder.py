@@ -3,9 +3,9 @@
     outputs/<model>[_<ablation>]_<data>_<scale>_<hash>/seed_<n>/
         run.json        status (running | finished | failed), reason, versions, hardware, ...
         config.yaml     resolved configuration
-        metrics.json    results;  curves.csv  what happened on the way;  log.txt  what was said
+        metrics.json    results;  curves.csv  values during training;  log.txt  messages
         checkpoints/    last.ckpt, previous.ckpt, best.ckpt
-        view/           pictures
+        view/           film strips, movies, curves
 
 The hash is a fingerprint of the resolved configuration without the seed and without what cannot change a result, so all
 seeds of one configuration stand beside each other, and a changed configuration never meets an old result.
@@ -142,7 +142,7 @@ class Run:
         return self.record.get("status") == "finished" and self.metrics_file.is_file()
 
     def start(self, command: str, device: torch.device) -> None:
-        """Records that work begins (or goes on) and with what."""
+        """Records that work begins or resumes, and with what."""
         make_folder(self.folder / "checkpoints")
         for part in self.folder.rglob(".*.part"):
             part.unlink()  # left by a kill in the middle of writing

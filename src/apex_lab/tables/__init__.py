@@ -5,7 +5,7 @@ found      what run folders hold
 choose     which runs stand in a row
 rows       mean and deviation of every cell
 build      bold entries, captions, notes
-commands   what to type for runs that are missing
+commands   the commands of missing runs
 markdown, latex, export    the same tables as Markdown, LaTeX, JSON and CSV
 """
 

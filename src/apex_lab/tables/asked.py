@@ -1,4 +1,4 @@
-"""Makes the paper's tables from the runs that are there, and says how to make the others.
+"""Makes the paper's tables from the runs that are there, and prints the commands of the others.
 
 python -m apex_lab.tables
 python -m apex_lab.tables scale=cpu tables=[1,3]
@@ -58,7 +58,7 @@ class TablesConfig(BaseModel):
 
 @dataclass(frozen=True)
 class Tables:
-    """One checked command: what is asked for, on which data and scale, and the words that say where things lie."""
+    """One checked command: what is asked for, on which data and scale, and the folders."""
 
     asked: TablesConfig
     data: str
@@ -191,7 +191,7 @@ def this_version() -> Version:
         try:
             raw = config.plain(compose("train", overrides=list(words)))
         except (HydraException, OmegaConfBaseException, UserError):
-            return None  # this version has no such configuration; the row says so
+            return None  # this version has no such configuration; the row notes it
         return runs.fingerprint(raw)
 
     return Version(

@@ -164,7 +164,7 @@ def _with_best(line: Line, best: Mapping[str, str], table: Table) -> Line:
 
 
 def _caption(table: Table, protocol: Protocol | None, options: Options) -> str:
-    """What a reader must know: data, scale, videos, what the deviation is over."""
+    """The caption's facts: data, scale, videos, what the deviation is over."""
     parts = [f"{table.caption}. Data {options.data}, scale {options.scale}"]
     if protocol is not None:
         if protocol.videos is not None and table.source == "metrics":

@@ -69,7 +69,7 @@ class Group:
 
 @dataclass(frozen=True)
 class Choice:
-    """The group of a row, if there is any, and what is to be said of the choice."""
+    """The group of a row, if there is any, and the remark on the choice."""
 
     group: Group | None
     notes: tuple[str, ...] = ()

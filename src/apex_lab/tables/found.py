@@ -70,7 +70,7 @@ class SeedRun:
         seed: n.
         record: content of run.json; None where it cannot be read.
         state: finished with scores; unfinished; diverged (training ended with a loss that was not finite); damaged.
-        why: what is to be said of a run that has not finished.
+        why: the remark on a run that has not finished.
         scores: key of `apex_lab.metrics.KEYS` -> value on the test split, NaN where undefined.
         protocol: of the scores.
         share: mean share of validation pixels given to objects at the end of training; None where it is not known.
@@ -92,7 +92,7 @@ class SeedRun:
 
     @property
     def words(self) -> str | None:
-        """model[_ablation]_data_scale, from run.json, else from the folder's name; None where neither says it."""
+        """model[_ablation]_data_scale, from run.json, else from the folder's name; None where neither has it."""
         if self.record is None:
             named = re.fullmatch(r"(.+)_[0-9a-f]{8}", self.group)
             return named.group(1) if named else None
@@ -110,7 +110,7 @@ class SeedRun:
 
 
 def run_words(model: str | None, ablation: str | None, data: str | None, scale: str | None) -> str:
-    """What the folder of a run is named by."""
+    """The words that name the folder of a run."""
     return "_".join(word for word in (model, ablation, data, scale) if word)
 
 
@@ -199,7 +199,7 @@ def _record(file: Path, seed: int) -> Record:
     assert isinstance(record, Record)
     if record.seed != seed:
         raise UserError(
-            f"{file} is of seed {record.seed}, but its folder is {file.parent.name}: mend the folder's name."
+            f"{file} is of seed {record.seed}, but its folder is {file.parent.name}: correct the folder's name."
         )
     return record
 

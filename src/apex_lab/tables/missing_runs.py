@@ -1,4 +1,4 @@
-"""What to type for runs that are missing."""
+"""The commands of missing runs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ABSENT = "not in this version"
 
 @dataclass(frozen=True)
 class Command:
-    """A command line and what is to be said of it."""
+    """A command line and the remark on it."""
 
     text: str
     remarks: tuple[str, ...]
@@ -45,7 +45,7 @@ def missing_runs(
         asked: names of run folders that were asked for.
         version: what this version can run.
         outputs: folder of the runs.
-        paths: words of the command line that say where runs and data lie.
+        paths: words of the command line for the folders of runs and data.
     """
     rows: dict[tuple[str, str | None], dict[str, Line]] = {}
     for table in tables:
@@ -84,7 +84,7 @@ def _training(
         seeds = wanted
         remarks.append("without the changed values")
     elif group is not None and group.current is False:
-        remarks.append(f"its other seeds have another configuration; seed={_joined(wanted)} makes the whole row anew")
+        remarks.append(f"its other seeds have another configuration; seed={_joined(wanted)} makes the whole row again")
     if not seeds:
         return None
     if not version.has(*row):

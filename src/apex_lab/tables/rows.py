@@ -1,4 +1,4 @@
-"""Rows as values: which seeds count, mean and deviation of every cell, and what is to be said of them."""
+"""Rows as values: which seeds count, mean and deviation of every cell, and remarks on them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ DDOF = 1
 """Seeds are a sample: deviations divide by n - 1 (metrics.md section 3)."""
 
 TRACKING = "tracking"
-"""Key of the column that says yes or no."""
+"""Key of the column with yes or no."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Cell:
 
     Attributes:
         values: seed -> unrounded values (one, or one per scenario of table 4), failed seeds that do not count included.
-        summary: over the seeds that count; None where no run says anything about this column.
+        summary: over the seeds that count; None where no run has this column.
         over_all: over all seeds with results.
         published: what the paper prints.
         best: whether it is the best of its column.
@@ -90,14 +90,14 @@ class Line:
         counted: seeds in the means.
         excluded: seed -> why it does not count though it may have results (failed-seed rule).
         failed: seed -> why it has no results: failed by the rule, or damaged.
-        unfinished: seed -> what its record says.
+        unfinished: seed -> the reason in its record.
         left_out: seed -> why its results cannot stand beside the others.
         missing: seeds that were never started.
         wanted: seeds that are asked for.
         candidate: whether it competes for bold.
         protocol: of its scores.
         cells: key of the column -> entry.
-        notes: what is to be said of it.
+        notes: remarks on it.
     """
 
     row: Row
@@ -128,7 +128,7 @@ class Line:
 
 @dataclass(frozen=True)
 class _Content:
-    """What a table is filled with: the results of each seed of each row."""
+    """The content of a table: the results of each seed of each row."""
 
     results: Mapping[int, Mapping[str, tuple[float, ...]]] = field(default_factory=dict)
     faults: Mapping[int, str] = field(default_factory=dict)

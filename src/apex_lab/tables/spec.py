@@ -60,7 +60,7 @@ class Row(_Part):
 
     @property
     def run(self) -> tuple[str, str | None]:
-        """What its runs are named by."""
+        """The words that name its runs."""
         return self.model, self.ablation
 
 
@@ -111,11 +111,11 @@ class Specification(_Part):
         return table.sections + (self.yardsticks if yardsticks and table.yardsticks else ())
 
     def label(self, row: Row) -> str:
-        """What a row is called."""
+        """The label of a row."""
         return row.label or self.models[row.model].label
 
     def latex(self, row: Row) -> str | None:
-        """What it is called in LaTeX, where that differs."""
+        """The label in LaTeX, where that differs."""
         return row.latex if row.label else self.models[row.model].latex
 
 
@@ -144,7 +144,7 @@ def load(place: Path | None = None) -> Specification:
     """Reads the specification; `place` is the folder where it lies (default: `folder`).
 
     Raises:
-        UserError: a file cannot be read, or says what cannot be; one sentence.
+        UserError: a file cannot be read, or holds an impossible value; one sentence.
     """
     place = place or folder()
     models = validate(_Models, {"models": _read(place / "models.yaml")}, "models.yaml")

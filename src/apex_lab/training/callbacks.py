@@ -1,4 +1,4 @@
-"""What happens beside training: checkpoints and the display of progress."""
+"""Callbacks of training: checkpoints and the display of progress."""
 
 from __future__ import annotations
 

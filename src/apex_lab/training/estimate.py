@@ -20,7 +20,7 @@ LONG = 3 * 3600.0
 
 
 def warning(config: Config, model: SceneModel) -> str | None:
-    """A warning for long training on a CPU; None if it is not long, or the data do not say how large videos are."""
+    """A warning for long training on a CPU; None if it is not long, or the data have no known size."""
     if "frames" not in config.data or "image_size" not in config.data or pixels(config) <= SMALL:
         return None
     seconds = seconds_on_cpu(config, model)

@@ -35,7 +35,7 @@ class Learner(L.LightningModule):
     """Makes weight updates, logs each loss term by name, and validates by the evaluation's scoring path.
 
     Args:
-        update: what is done in a step.
+        update: the weight update.
         optimizer: named parameters -> optimiser over them.
         log_interval: steps between two logged steps.
         rank, ranks: which process this is, of how many.

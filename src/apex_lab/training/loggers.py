@@ -26,7 +26,7 @@ class Curves(Logger):
 
     Args:
         path: the file; rows that are there already are kept up to `step`.
-        step: the step a resumed run goes on from; later rows belong to work that was lost and will be done again.
+        step: the step that a run resumes from; later rows belong to work that was lost and will be done again.
     """
 
     def __init__(self, path: Path, step: int = 0) -> None:

@@ -110,7 +110,7 @@ class Muon(Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """One update; `closure`, where there is one, computes loss and gradients anew."""
+        """One update; `closure`, where there is one, computes loss and gradients again."""
         loss = None
         if closure is not None:
             with torch.enable_grad():

@@ -38,7 +38,7 @@ class Ranks:
 
 
 def given() -> Ranks | None:
-    """What torchrun, or rank 0 of this package, says in the environment; None where nobody does."""
+    """Rank and world size that torchrun, or rank 0 of this package, sets in the environment; None without them."""
     if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
         return Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
     return None
@@ -55,7 +55,7 @@ def started(job: dict[str, Any], devices: int, nodes: int, folder: Path) -> Iter
         folder: the run's, where ranks that a launcher has started find the job.
 
     Raises:
-        UserError: several nodes without a launcher that says which one this is.
+        UserError: several nodes without a launcher that gives each its rank.
     """
     outside = given()
     if outside is not None:

@@ -63,7 +63,7 @@ class WeightUpdate(nn.Module):
         schedules: the values of `Context.schedule`.
         weights: loss term -> its weight. A weight that is 0 at every step takes its term out, even where it is not
             finite.
-        lr_scale: what all of the optimiser's learning rates are multiplied by.
+        lr_scale: factor of all of the optimiser's learning rates.
         clip_norm: gradients of all parameters together are scaled down to this norm; None leaves them.
         seed: of the noise.
         precision: 32 or "bf16-mixed".

@@ -1,4 +1,4 @@
-"""Pictures of what a model says about a video: film strips, movies, panels per component, curves."""
+"""Drawings of a model's output for a video: film strips, movies, panels per component, curves."""
 
 from apex_lab.view.components import component_panels
 from apex_lab.view.curves import curve_page

@@ -1,4 +1,4 @@
-"""What all pictures share: fonts, cells, writing."""
+"""Shared by all drawings: fonts, cells, writing."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def cell_size(height: int, width: int, target: int) -> tuple[int, int]:
 
 
 def enlarge(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) or (H, W, C) resized to (height, width) = `size` without smoothing: every value stays what it is."""
+    """(H, W) or (H, W, C) resized to (height, width) = `size` without smoothing: no value changes."""
     height, width = picture.shape[:2]
     rows = (np.arange(size[0]) * 2 + 1) * height // (2 * size[0])
     columns = (np.arange(size[1]) * 2 + 1) * width // (2 * size[1])

@@ -85,9 +85,9 @@ def lives(scene: Scene) -> list[Life]:
 
 
 def component_panels(path: Path, item: Item, max_components: int = 10) -> None:
-    """Draws what each component of a video is and does.
+    """Draws each component of a video over time.
 
-    A row shows, for the first, middle and last frame in which the identity is there: its soft mask, its own picture
+    A row shows, for the first, middle and last frame in which the identity is there: its soft mask, its own image
     (`Scene.means`; without them the input under its mask), and its window on the input (left out for models without
     windows). At the end: presence over time (bars) and the share of pixels under its mask (line, on an axis of
     its own, at the right).

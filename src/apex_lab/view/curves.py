@@ -47,7 +47,7 @@ _ORDER = (
 """Panels in reading order, by what is found in their names; `_REST` is the loss terms and all not named here."""
 
 _TITLES = {"share": "share of pixels (0: largest object)"}
-"""What panels are called whose names do not say enough."""
+"""Titles of panels whose keys are too short."""
 
 _SCORE = re.compile(r"^(video_)?(ari|msc|sc)(_fg)?$")
 """Quantities whose best value is 1; drawn on an axis that ends there."""
@@ -60,7 +60,7 @@ def curve_page(path: Path, curves_csv: Path) -> None:
     share a panel. Columns that differ by a number at the end (`diagnostics/share_0`, `diagnostics/share_1`, ...) share
     a panel as well, one line each. Empty cells are skipped, so columns may be logged at steps of their own; columns
     without any number are left out. Quantities that stay positive and reach more than 30 times their median get a
-    logarithmic axis; of others, peaks far outside the usual range are cut off, and the title tells how far they reach.
+    logarithmic axis; of others, peaks far outside the usual range are cut off, and the title gives their height.
     Long noisy curves are drawn faintly with their running median on top. The page is headed by the run folder's name.
 
     Args:

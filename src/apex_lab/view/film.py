@@ -1,4 +1,4 @@
-"""Film strips: frames from left to right, what was seen, said and true from top to bottom."""
+"""Film strips: frames from left to right, input, prediction and truth from top to bottom."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One video of a batch, what a model said about it, and the truth: what every picture is made of."""
+"""One video of a batch, a model's output for it, and the truth: the input of every drawing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Item(NamedTuple):
     Attributes:
         name: caption and part of file names, such as "video 12".
         video: the batch, uint8 or float in [0, 1].
-        scene: what a model said about that batch.
+        scene: a model's output for that batch.
         b: which video of the batch is drawn.
         segmentation: ground truth, 0 is background; None if there is none (the row is left out).
     """

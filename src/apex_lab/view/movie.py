@@ -1,4 +1,4 @@
-"""Moving pictures: several videos side by side with what a model says about them, as MP4 and as GIF."""
+"""Movies: several videos side by side with a model's output for them, as MP4 and as GIF."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ from apex_lab.models.apex import (
 from apex_lab.models.apex.objective import DiscoveryPrior
 from apex_lab.models.apex.objects import Proposals
 from apex_lab.models.apex.rollout import State, Step
-from apex_lab.scene import Context, Noise, Scene, schedule_at
+from apex_lab.scene import Context, Noise, Scene, Schedule, schedule_at
 
 SIZE = 32
 SCHEDULE = schedule_at(
@@ -177,7 +177,7 @@ def video(b: int = 3, t: int = 4) -> torch.Tensor:
 class Inside:
     """Runs a model and keeps what its loop over time left behind: proposals, steps and the background's sample."""
 
-    def __init__(self, model: Apex, x: torch.Tensor, schedule: dict[str, torch.Tensor] = SCHEDULE) -> None:
+    def __init__(self, model: Apex, x: torch.Tensor, schedule: Schedule = SCHEDULE) -> None:
         explain, decode = model._explain, model.background.decode
         proposals: list[Proposals] = []
         steps: list[Step] = []
@@ -189,7 +189,7 @@ class Inside:
             left: Step,
             context: Context,
             noise: Noise | None,
-            state_with: Callable[[torch.Tensor], State],
+            state_with: Callable[[Tensor], State],
         ) -> Scene:
             proposals.append(found)
             steps.append(left)

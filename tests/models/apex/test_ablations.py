@@ -107,7 +107,7 @@ def test_all_other_weights_are_the_same_from_the_same_seed(name: str) -> None:
 def test_it_trains(name: str) -> None:
     config, model = checked(name), built(name)
     schedules, weights = build_schedules(config), build_weights(config)
-    update = WeightUpdate(model, schedules, weights, step=10_000)
+    update = WeightUpdate(model.train(), schedules, weights, step=10_000)
     optimizer = remember_rates(build_optimizer(config, named_parameters(model)))
     before = {key: value.clone() for key, value in model.named_parameters()}
     for _ in range(2):

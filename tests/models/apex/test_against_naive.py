@@ -19,8 +19,10 @@ SCALES = (1.25, 0.75)  # of sigma_fg and sigma_bg
 def check(model: Apex, x: torch.Tensor) -> list[naive.Told]:
     """Compares everything that the two say; returns what the slow one told."""
     with torch.no_grad():
-        scales = schedule_at(dict(zip(("sigma_fg_scale", "sigma_bg_scale"), SCALES, strict=True)))
-        scene = model(x, Context({**SCHEDULE, **scales}))
+        scene = model(
+            x,
+            Context({**SCHEDULE, **schedule_at(dict(zip(("sigma_fg_scale", "sigma_bg_scale"), SCALES, strict=True)))}),
+        )
     told = [naive.explain(model, one, P0, SCALES) for one in x]
     for b, want in enumerate(told):
         assert scene.ids[b, :, :-1].tolist() == want.slots

@@ -16,7 +16,7 @@ from apex_lab.models.apex.objects import Objects
 from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.spatial_transformer import Paster
-from apex_lab.scene import Context, Scene, Statistics
+from apex_lab.scene import Context, Scene, Statistics, schedule_at
 from tests.models.apex.small import CONTEXT, SCHEDULE, parts, tiny, video
 
 
@@ -223,8 +223,7 @@ def test_refusals() -> None:
 def test_the_scales_of_the_sigmas_widen_those_of_the_whole_model(fg: float, bg: float) -> None:
     def terms(sigma_fg: float, sigma_bg: float, **scales: float) -> dict[str, torch.Tensor]:
         model = tiny(likelihood=MixtureLikelihood(sigma_fg, sigma_bg)).eval()
-        schedule = {**SCHEDULE, **{name: torch.tensor(scale) for name, scale in scales.items()}}
-        return model(video(), Context(schedule)).terms
+        return model(video(), Context({**SCHEDULE, **schedule_at(scales)})).terms
 
     scaled = terms(0.1, 0.05, sigma_fg_scale=fg, sigma_bg_scale=bg)
     wide, narrow = terms(0.1 * fg, 0.05 * bg), terms(0.1, 0.05)
@@ -249,8 +248,10 @@ def test_the_posterior_is_bayes_rule_on_what_the_scene_shows() -> None:
 
 def test_a_posterior_is_refused_without_detail_and_under_one_gaussian() -> None:
     model = tiny().eval()
+    scene = model(video(), Context(SCHEDULE))
+    assert scene.means is None
     with pytest.raises(ValueError, match=r"no means: give Context\(detail=True\)"):
-        model.posterior(model(video(), Context(SCHEDULE)), video(), CONTEXT)
+        model.posterior(scene, video(), CONTEXT)
     model = tiny(likelihood=GaussianLikelihood()).eval()
     assert not model.has_posterior
     with pytest.raises(TypeError, match="Apex has no mixture likelihood"):

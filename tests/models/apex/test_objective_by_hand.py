@@ -11,9 +11,9 @@ from torch import Tensor
 from apex_lab.models.apex import Apex, ApexNormalisation, MixtureLikelihood
 from apex_lab.models.apex.rollout import Memory, State
 from apex_lab.nn.distributions import Gaussian
-from apex_lab.scene import Context, schedule_at
+from apex_lab.scene import schedule_at
 from tests.models.apex import naive
-from tests.models.apex.small import SCHEDULE, SIZE, Inside, lively, video
+from tests.models.apex.small import CONTEXT, SIZE, Inside, lively, video
 
 P0 = 0.1
 OPEN = schedule_at(
@@ -162,12 +162,13 @@ def test_presence_of_discoveries_is_what_propagation_left_open() -> None:
 
 
 def test_the_terms_in_float32_are_those_in_float64() -> None:
-    """The same latents and weights, and no noise for the background, through `_explain` in both precisions."""
+    """The same latents and weights, and no new noise, through `_explain` in both precisions."""
     model = lively()
     seen = trained(model)
 
-    def stateless(z: Tensor) -> State:
-        return State((z, z), z, Memory.empty(2, 3, 1, 1, z), z)
+    def no_state(z_background: Tensor) -> State:
+        empty = Memory.empty(2, 3, 6, 12, z_background)
+        return State((z_background, z_background), z_background, empty, z_background)
 
     def in_float32(x: object) -> object:
         if isinstance(x, Tensor):
@@ -176,10 +177,9 @@ def test_the_terms_in_float32_are_those_in_float64() -> None:
         return type(x)(*(in_float32(y) for y in x))
 
     with torch.no_grad():
-        context = Context(SCHEDULE)
-        exact = model._explain(video(2, 4).double(), seen.proposals, seen.steps, context, None, stateless)
-        proposals, steps = in_float32(seen.proposals), in_float32(seen.steps)
-        rounded = model.float()._explain(video(2, 4), proposals, steps, context, None, stateless)  # type: ignore[arg-type]
+        exact = model._explain(video(2, 4).double(), seen.proposals, seen.steps, CONTEXT, None, no_state)
+        found, steps = in_float32(seen.proposals), in_float32(seen.steps)
+        rounded = model.float()._explain(video(2, 4), found, steps, CONTEXT, None, no_state)  # type: ignore[arg-type]
     for name, value in exact.terms.items():
         torch.testing.assert_close(rounded.terms[name].double(), value, rtol=1e-4, atol=1e-3)
     assert (rounded.masks - exact.masks).abs().max() < 1e-5

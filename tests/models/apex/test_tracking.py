@@ -92,17 +92,22 @@ def ideal(masks: MaskNormalisation | None = None, stop_at: int | None = None) ->
 
 
 def follow(model: Apex, x: Tensor) -> Scene:
-    schedule = schedule_at(
-        {
-            "temperature": 0.1,
-            "discovery_presence": 1e-3,
-            "carry": 1.0,
-            "discover": 0.0,
-            "sigma_fg_scale": 1.0,
-            "sigma_bg_scale": 1.0,
-        }
+    return model(
+        x,
+        Context(
+            schedule_at(
+                {
+                    "temperature": 0.1,
+                    "discovery_presence": 1e-3,
+                    "carry": 1.0,
+                    "discover": 0.0,
+                    "sigma_fg_scale": 1.0,
+                    "sigma_bg_scale": 1.0,
+                }
+            ),
+            detail=True,
+        ),
     )
-    return model(x, Context(schedule, detail=True))
 
 
 @pytest.mark.parametrize("masks", [None, ScalorNormalisation()])

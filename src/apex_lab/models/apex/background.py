@@ -21,7 +21,7 @@ BRIGHTEST = math.log(2)
 
 
 class Background(nn.Module):
-    """z_bg and its picture.
+    """z_bg and its image.
 
     Args:
         image_size: side of the image in pixels.
@@ -31,7 +31,7 @@ class Background(nn.Module):
             logits: a parameter, initialised at the training set's per-pixel median, as one initialises an output bias
             at the mean of the data. A convolutional decoder needs thousands of steps to draw sharp static edges, and
             until then the foreground explains them.
-        change: what z_bg may do to the picture. `colour` is the paper's: anything. `shade` lets it darken or (less)
+        change: what z_bg may do to the image. `colour` is the paper's: anything. `shade` lets it darken or (less)
             brighten the bias image, all channels of a pixel alike in their logits, which needs a `learned` one. Over a
             table that has a hue that draws cast shadows, but few of the grey parts of a moving arm, which `colour`
             draws too, so that the foreground never explains them.
@@ -65,7 +65,7 @@ class Background(nn.Module):
         self.bias_image = nn.Parameter(torch.zeros(3, image_size, image_size)) if bias_image == "learned" else None
 
     def initialise(self, median: Float[Tensor, "3 H W"]) -> None:
-        """Starts the picture at the training set's median, if there is a bias image."""
+        """Starts the image at the training set's median, if there is a bias image."""
         if self.bias_image is None:
             return
         with torch.no_grad():

@@ -50,7 +50,7 @@ class Glimpses(nn.Module, ABC):
         features: Float[Tensor, "B T F h w"],
         before: Float[Tensor, "B 3 H W"] | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """What glimpses and propagation crops are cut from, each (B, T, C, h, w).
+        """Sources of glimpses and propagation crops, each (B, T, C, h, w).
 
         Args:
             video: RGB in [0, 1].
@@ -94,7 +94,7 @@ class FeatureGlimpses(Glimpses):
 
 
 class ImageGlimpses(Glimpses):
-    """From the image x_t; a propagation crop also sees the previous frame, since motion is what it is for."""
+    """From the image x_t; a propagation crop also sees the previous frame, since it infers motion."""
 
     pixels_per_size = 2
 

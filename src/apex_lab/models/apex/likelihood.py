@@ -33,7 +33,7 @@ class _LogMixture(torch.autograd.Function):
     """log sum_k exp(log_m_k + log N(x; mu_k, sigma_k)) per pixel and channel, with its gradient written by hand.
 
     This is the largest computation of a training step: plain autograd keeps some ten tensors of the size of all
-    components' pictures, this keeps the responsibilities alone.
+    components' images, this keeps the responsibilities alone.
     """
 
     @staticmethod
@@ -100,7 +100,7 @@ class Likelihood(ABC):
             objects: their means, RGB in [0, 1].
             log_background: log mask of the background; finite.
             background: its mean.
-            scale_fg, scale_bg: what sigma_fg and sigma_bg are multiplied by; None leaves them. No gradient goes there.
+            scale_fg, scale_bg: factors of sigma_fg and sigma_bg; None leaves them. No gradient goes there.
         """
 
 
@@ -157,7 +157,7 @@ class MixtureLikelihood(Likelihood):
         Args:
             image: RGB in [0, 1].
             masks: of all components, sum to 1 over K.
-            means: their pictures, RGB in [0, 1].
+            means: their images, RGB in [0, 1].
             background: which components have the background's standard deviation.
             scale_fg, scale_bg: as in `__call__`.
         """
@@ -171,7 +171,7 @@ class MixtureLikelihood(Likelihood):
 
 
 class GaussianLikelihood(Likelihood):
-    """One Gaussian around the blended picture, N(x; sum_k m_k mu_k, sigma^2): the `gaussian` ablation.
+    """One Gaussian around the blended image, N(x; sum_k m_k mu_k, sigma^2): the `gaussian` ablation.
 
     Args:
         sigma: standard deviation in units of RGB in [0, 1]; the paper names none, default sigma_fg. So it is what

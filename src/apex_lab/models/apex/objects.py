@@ -1,4 +1,4 @@
-"""Foreground objects: what is inferred about each of them, by propagation and by discovery, and what was expected.
+"""Foreground objects: the posterior of each, by propagation and by discovery, and its prior.
 
 Symbols as in apex.md: z_what (appearance and mask), z_where (window), z_pres (presence).
 """
@@ -126,7 +126,7 @@ class Propagation(nn.Module):
         still = torch.tensor([0.0] * 4 + [NARROW] * 4)  # no change
         _set_last_bias(self.head_where, still)
         _set_last_bias(self.prior_where, still)
-        stays = torch.tensor([3.0])  # an object that was there is expected to be there
+        stays = torch.tensor([3.0])  # a priori an object stays
         _set_last_bias(self.head_pres, stays)
         _set_last_bias(self.prior_pres, stays)
 
@@ -141,7 +141,7 @@ class Propagation(nn.Module):
         temperature: Tensor,
         noise: Noise | None,
     ) -> tuple[Objects, Beliefs]:
-        """Objects at t - 1 and the sources at t -> objects at t, and what was believed and expected of them."""
+        """Objects at t - 1 and the sources at t -> objects at t, with their posterior and prior."""
         b, p = before.presence.shape
 
         def each(cell: nn.GRUCell, hidden: Tensor, *inputs: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""What APEX says about a video: pictures of its frames, and the `Scene` of the objects that are carried on."""
+"""APEX's result for a video: its rendered frames, and the `Scene` of the objects that are carried on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BACKGROUND_ID = 0
 
 
 class Drawn(NamedTuple):
-    """What N frames are drawn from: fields of `Step` of R components."""
+    """Inputs of rendering N frames: fields of `Step` of R components."""
 
     alpha: Float[Tensor, "N R g g"]
     presence: Float[Tensor, "N R"]
@@ -29,11 +29,11 @@ class Drawn(NamedTuple):
 
 
 class Picture(NamedTuple):
-    """N frames as they are drawn; of a whole video with dimensions (B, T) in place of N.
+    """N rendered frames; of a whole video with dimensions (B, T) in place of N.
 
     objects (N, R, H, W): masks; foreground (N, H, W): m_fg; reconstruction (N, 3, H, W): RGB in [0, 1].
     log_likelihood, mask_entropy (N,): nats.
-    backdrop (N, 3, H, W): the background's picture; means (N, R, 3, H, W): the objects' images or None.
+    backdrop (N, 3, H, W): the background's image; means (N, R, 3, H, W): the objects' images or None.
     """
 
     objects: Tensor
@@ -46,7 +46,7 @@ class Picture(NamedTuple):
 
 
 def video_of(pictures: Sequence[Picture], batch: int) -> Picture:
-    """Pictures of parts of `batch` videos, all of whose frames are in order -> dimensions (B, T) in place of N."""
+    """Rendered parts of `batch` videos, all of whose frames are in order -> dimensions (B, T) in place of N."""
 
     def whole(name: str) -> Tensor:
         return joined(getattr(picture, name) for picture in pictures).unflatten(0, (batch, -1))

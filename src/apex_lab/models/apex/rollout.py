@@ -15,7 +15,7 @@ from apex_lab.scene import ABSENT
 class Frame(NamedTuple):
     """What the loop reads of one frame, all of it made before the loop; D cells of discovery.
 
-    look_at, follow_in (B, C, h, w): what glimpses and propagation crops are cut from.
+    look_at, follow_in (B, C, h, w): sources of glimpses and propagation crops.
     what (B, D, Z), place (B, D, 4), prob (B, D), hidden_what (B, D, hidden): proposals, as in `Proposals`.
     alpha (B, D, g, g): their mask logits.
     """

@@ -56,7 +56,7 @@ def carry(
     fresh_score = torch.where(fresh, score[:, slots:], -torch.ones_like(score[:, slots:]))
     newcomers = fresh_score.argsort(dim=1, descending=True, stable=True)
     arrivals = fresh.sum(1)
-    rank = (~stays).cumsum(1) - 1  # the how-manieth free slot this is
+    rank = (~stays).cumsum(1) - 1  # index among the free slots
     fills = ~stays & (rank < arrivals[:, None])
     picked = newcomers.gather(1, rank.clamp(0, newcomers.shape[1] - 1))
     source = torch.where(fills, slots + picked, torch.arange(slots, device=ids.device).expand_as(ids))

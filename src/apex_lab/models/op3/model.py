@@ -23,7 +23,7 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class State(NamedTuple):
-    """What the next frame needs: all else is set anew by the dynamics step that it starts with.
+    """What the next frame needs; the dynamics step that it starts with computes all else again.
 
     Attributes:
         deterministic: d, (B, K, R).
@@ -72,7 +72,7 @@ class Op3(SceneModel):
     """Object-centric perception, prediction and planning, without actions.
 
     A scene model whose slots are found by iterative refinement: a network looks at what the slots draw, at how well
-    that fits the frame and at the gradients of the loss, and proposes the slots' posterior anew. An interaction
+    that fits the frame and at the gradients of the loss, and replaces the slots' posterior. An interaction
     network predicts the slots of the next frame, where refinement starts again.
 
     In evaluation mode no graph is built, so whole videos need the memory of one frame (and their masks). Sampling

@@ -161,7 +161,7 @@ class Encoder(nn.Module):
         return self.tokens(maps)
 
     def tokens(self, maps: Float[Tensor, "N C h w"]) -> Float[Tensor, "N L C"]:
-        """Pixels of a feature map, told where they are and normalised one by one."""
+        """Pixels of a feature map, with their position code, normalised one by one."""
         maps = maps + self.position(*maps.shape[-2:])
         return self.mlp(self.norm(maps.permute(0, 2, 3, 1).flatten(1, 2)))
 

@@ -16,9 +16,9 @@ from apex_lab.scene import Context, Scene, SceneModel, Statistics
 
 
 class BackgroundSubtraction(SceneModel):
-    """Whatever differs from the median picture is an object. For a camera that stands still.
+    """A region that differs from the median image is an object. For a camera that stands still.
 
-    1. A pixel is foreground where its RGB distance to the median picture exceeds `threshold`. Shadows are no objects:
+    1. A pixel is foreground where its RGB distance to the median image exceeds `threshold`. Shadows are no objects:
        the distance is taken to the nearest shade of the median colour, from `shadow` times that colour to the colour
        itself.
     2. The foreground is cleaned by an opening with a disc of `radius` pixels. There is no closing: it would fill the
@@ -26,7 +26,7 @@ class BackgroundSubtraction(SceneModel):
     3. Its connected regions (8 neighbours) of at least `min_area` are the objects, the `max_objects` largest of them.
     4. Regions of consecutive frames are linked (`apex_lab.models.yardsticks.linking.link`).
 
-    The reconstruction is the median picture with every object in its mean colour. The median picture is a buffer, so
+    The reconstruction is the median image with every object in its mean colour. The median image is a buffer, so
     checkpoints carry it. Defaults were chosen by the four segmentation scores of 32 training videos of P2D: labels
     chose them.
 
@@ -64,7 +64,7 @@ class BackgroundSubtraction(SceneModel):
         """Takes the training set's per-pixel median, RGB in [0, 1].
 
         Raises:
-            ValueError: the picture has another size than `image_size`.
+            ValueError: the image has another size than `image_size`.
         """
         median = statistics.median
         if median.shape != self.median.shape:
@@ -79,7 +79,7 @@ class BackgroundSubtraction(SceneModel):
         """RGB video in [0, 1]; `context` has no influence. Works on the CPU, wherever the video lies.
 
         Raises:
-            ValueError: frames of another size than `image_size`, or no median picture yet.
+            ValueError: frames of another size than `image_size`, or no median image yet.
         """
         if video.shape[2:] != self.median.shape:
             raise ValueError(
@@ -87,7 +87,7 @@ class BackgroundSubtraction(SceneModel):
                 f"set model.image_size={video.shape[-1]}"
             )
         if self.median.isnan().any():
-            raise ValueError("BackgroundSubtraction has no median picture yet: call initialise(statistics) first")
+            raise ValueError("BackgroundSubtraction has no median image yet: call initialise(statistics) first")
         median = self.median.to(video)
         # the shade a · median nearest to a colour x: a = <x, median> / <median, median>, held within its limits
         shade = (video * median).sum(dim=2) / median.square().sum(dim=0).clamp(min=1e-6)

@@ -15,7 +15,7 @@ from apex_lab.scene import ABSENT, Context, Scene, SceneModel
 
 
 class Oracle(SceneModel):
-    """Says what the labels say: component k is the label k, its identity is k, label 0 is the background.
+    """Returns the labels as a scene: component k is the label k, its identity is k, label 0 is the background.
 
     Each component shows the video itself, so the reconstruction is exact. `appearance` is the label as a one-hot
     vector: the distance of two objects is 0 if they carry the same label and sqrt(2) otherwise.

@@ -74,7 +74,7 @@ def hard_scene(
     appearance: Float[Tensor, "B T K A"],
     means: Float[Tensor, "B T K 3 H W"],
 ) -> Scene:
-    """A scene in which each pixel belongs to one component and shows that component's picture.
+    """A scene in which each pixel belongs to one component and shows that component's image.
 
     `masks` is `one_hot(labels, K)`, handed in because the callers have it.
     """

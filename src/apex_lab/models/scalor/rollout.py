@@ -1,0 +1,265 @@
+"""The loop over time: propagation, discovery, which objects are kept (scalor.md section 2, steps 1 to 3 and 7)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from apex_lab.models.scalor.composition import Layers, clamped, layers_of, paster_of
+from apex_lab.models.scalor.discovery import Discovery, Proposals, Rejection, room
+from apex_lab.models.scalor.encoder import LSTMState
+from apex_lab.models.scalor.glimpses import GlimpseDecoder, GlimpseEncoder
+from apex_lab.models.scalor.latents import Sampler, full_precision
+from apex_lab.models.scalor.propagation import Propagated, Propagation
+from apex_lab.models.scalor.recompute import Recompute
+from apex_lab.models.scalor.slots import FIRST_ID, Objects, Slots, carry, keep, pack, strongest, taken
+from apex_lab.models.scalor.windows import SizeRule, window_of
+from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.precision import full
+from apex_lab.scene import ABSENT, Noise, Schedule
+
+CURRICULUM_ALPHA = 0.9
+"""Mask of every proposal under the alpha curriculum, when the foreground's mask is computed."""
+
+
+class State(NamedTuple):
+    """What the next chunk of the same videos starts from.
+
+    memory: of the ConvLSTM. slots: objects. background: z_bg of the last frame, and the state of its prior's GRU.
+    """
+
+    memory: LSTMState
+    slots: Slots
+    background: tuple[Tensor, Tensor]
+
+
+class Step(NamedTuple):
+    """One frame as the loop leaves it; P propagated slots, D discovery cells.
+
+    propagated: None in the first frame of a video, where no slot holds anything.
+    alive (B, P): the slot came into the frame with an object.
+    proposals: before rejection.
+    accepted (B, D): not rejected. found (B, D): z_pres after rejection and training's cap.
+    drawn (B, P, C, g, g) or None, drawn_found (B, D, C, g, g): alpha without gradient; after o where gradients are off.
+    source, kept, ids (B, P): what the slots hold after the frame, as in `slots.Kept`.
+    """
+
+    propagated: Propagated | None
+    alive: Bool[Tensor, "B P"]
+    proposals: Proposals
+    accepted: Bool[Tensor, "B D"]
+    found: Float[Tensor, "B D"]
+    drawn: Float[Tensor, "B P C g g"] | None
+    drawn_found: Float[Tensor, "B D C g g"]
+    source: Int[Tensor, "B P"]
+    kept: Bool[Tensor, "B P"]
+    ids: Int[Tensor, "B P"]
+
+
+class ObjectNetworks(nn.Module):
+    """All networks that know of objects, and the loop over frames that they run in.
+
+    Args:
+        image_size: H = W in pixels.
+        grid: G.
+        glimpse_size: g, side of glimpses in pixels.
+        what: length of z_what.
+        size: rule of a box's size.
+        max_objects, evaluation_objects: P in training and in evaluation.
+        track: a discovery with a presence above this is carried on.
+        stop: as in `Propagation`.
+        deep_heads: heads with a hidden layer (images of 128 px).
+        recompute: of the glimpse decoder and the composition. recompute_looks: of the glimpse encoder.
+    """
+
+    def __init__(
+        self,
+        image_size: int,
+        grid: int,
+        glimpse_size: int,
+        what: int,
+        size: SizeRule,
+        max_objects: int,
+        evaluation_objects: int,
+        track: float,
+        stop: float,
+        deep_heads: bool,
+        recompute: Recompute,
+        recompute_looks: Recompute,
+    ) -> None:
+        super().__init__()
+        self.image_size, self.what, self.track = image_size, what, track
+        self.max_objects, self.evaluation_objects = max_objects, evaluation_objects
+        self.recompute, self.recompute_looks = recompute, recompute_looks
+        self.glimpse_encoder = GlimpseEncoder(glimpse_size, what)
+        self.glimpse_decoder = GlimpseDecoder(glimpse_size, what, deep_heads)
+        self.discovery = Discovery(image_size, grid, size, deep_heads)
+        self.propagation = Propagation(grid, what, size, stop)
+        self.rejection = Rejection()
+
+    def forward(
+        self,
+        video: Float[Tensor, "B T 3 H W"],
+        features: Float[Tensor, "B T 64 G G"],
+        slots: Slots | None,
+        noise: Noise | None,
+        schedule: Schedule,
+    ) -> tuple[list[Step], Slots]:
+        """Frames, and the slots after the last one.
+
+        Only what the next frame depends on happens here; the frames are rendered later, all at once (`render`).
+
+        Args:
+            video: RGB in [0, 1].
+            features: e_t.
+            slots: after the frame before the first; None at the start of a video.
+            noise: None takes means in place of samples.
+            schedule: as in `Scalor.schedule_ranges`.
+        """
+        steps = []
+        for t, (image, feature) in enumerate(zip(video.unbind(1), features.unbind(1), strict=True)):
+            sampler = Sampler(None if noise is None else noise.at(t), schedule["temperature"])
+            propagated, drawn, explained = self._propagate(image, feature, slots, sampler)
+            slots = slots or self._no_objects(video)
+            proposals, drawn_found, accepted = self._propose(image, feature, explained, sampler)
+            found = proposals.presence.squeeze(-1) * accepted
+            if self.training:
+                found = found * strongest(found.detach(), room(slots.valid, self.max_objects))
+            source, after = self._keep(slots, propagated, proposals, found, schedule)
+            steps.append(
+                Step(
+                    propagated,
+                    slots.valid,
+                    proposals,
+                    accepted,
+                    found,
+                    drawn,
+                    drawn_found,
+                    source,
+                    after.valid,
+                    after.ids,
+                )
+            )
+            slots = after
+        assert slots is not None
+        return steps, slots
+
+    def _no_objects(self, video: Tensor) -> Slots:
+        b, count = len(video), self.max_objects if self.training else self.evaluation_objects
+        hidden, hidden_prior = self.propagation.tracker.hidden_size, self.propagation.prior.rnn.hidden_size
+        what, one = video.new_zeros(b, count, self.what), video.new_zeros(b, count, 1)
+        return Slots(
+            Objects.found(what, video.new_zeros(b, count, 4), one, one, hidden, hidden_prior),
+            torch.zeros(b, count, dtype=torch.bool, device=video.device),
+            torch.full((b, count), ABSENT, device=video.device),
+            torch.full((b,), FIRST_ID, device=video.device),
+        )
+
+    def _propagate(
+        self, image: Tensor, feature: Tensor, slots: Slots | None, sampler: Sampler
+    ) -> tuple[Propagated | None, Tensor | None, Tensor | None]:
+        """Objects of the frame before in this frame, drawn, and the sum of their masks (B, H, W), without gradient."""
+        if slots is None:
+            return None, None, None
+        propagated = self.propagation(
+            slots.objects, slots.valid, feature, image, self.glimpse_encoder, sampler, self.recompute_looks
+        )
+        objects = propagated.objects
+        drawn = self._drawn(objects.what)
+        with torch.no_grad(), full_precision(image):
+            masks = full(drawn[:, :, -1]) * objects.presence[..., None]
+            explained = paster_of(window_of(objects.where), masks.shape[-1], self.image_size).total(masks)
+        return propagated, drawn, explained
+
+    def _propose(
+        self, image: Tensor, feature: Tensor, explained: Tensor | None, sampler: Sampler
+    ) -> tuple[Proposals, Tensor, Tensor]:
+        """Proposals, drawn, and which of them propagated objects do not explain already."""
+        mask = clamped(torch.zeros_like(image[:, 0]) if explained is None else explained)
+        proposals = self.discovery(feature, mask, image, self.glimpse_encoder, sampler, self.recompute_looks)
+        drawn = self._drawn(proposals.what)
+        if explained is None:
+            return proposals, drawn, torch.ones_like(proposals.logit, dtype=torch.bool)
+        windows = window_of(proposals.where).detach()
+        return proposals, drawn, self.rejection.kept(drawn[:, :, -1], windows, mask)
+
+    def _drawn(self, what: Float[Tensor, "B K Z"]) -> Float[Tensor, "B K C g g"]:
+        """Masks for the decisions of the loop, which have no gradient; where there is none at all, colours too."""
+        alpha_only = torch.is_grad_enabled()
+        with torch.no_grad():
+            return self.glimpse_decoder(what, alpha_only)
+
+    def _keep(
+        self, slots: Slots, propagated: Propagated | None, proposals: Proposals, found: Tensor, schedule: Schedule
+    ) -> tuple[Int[Tensor, "B P"], Slots]:
+        """Candidates that the slots hold after this frame, and the slots."""
+        old = slots.objects if propagated is None else propagated.objects  # in the first frame all slots are empty
+        kept = keep(old.presence.squeeze(-1) > 0, found > self.track, slots.ids, slots.next_id)
+        new = Objects.found(
+            proposals.what,
+            proposals.where,
+            proposals.depth,
+            found[..., None],
+            old.tracker.shape[-1],
+            old.prior_h.shape[-1],
+        )
+        objects = carry((old, new), kept, schedule["slot_gradient"])
+        return kept.source, Slots(objects, kept.valid, kept.ids, kept.next_id)
+
+    def render(self, steps: list[Step], schedule: Schedule) -> Layers:
+        """All frames of a video as they are rendered, (B, T, ...) in place of (N, ...).
+
+        In training at most P of the P + D candidates of a frame have a presence above zero (the cap on discoveries
+        sees to that), so only these are drawn with gradients.
+        """
+        values = torch.stack([_rendered(step) for step in steps], dim=1)
+        slots = steps[0].alive.shape[1]
+        full = steps[0].drawn_found.shape[2] > 1
+        index = torch.arange(values.shape[2], device=values.device).expand(values.shape[:3])
+        if self.training and not full:
+            present = values[..., 0].detach().flatten(0, 1) > 0
+            index, valid = (
+                x.unflatten(0, values.shape[:2]) for x in pack(present, min(self.max_objects, values.shape[2]))
+            )
+            presence, others = taken(values, index).split([1, values.shape[-1] - 1], dim=-1)
+            values = torch.cat([presence * valid[..., None], others], dim=-1)
+        curriculum = (schedule["alpha_curriculum"] > 0.5) & (index >= slots)
+        counted = torch.where(curriculum, 0.0, 1.0)
+        drawn = [joined_candidates(step, step.drawn, step.drawn_found) if full else None for step in steps]
+        frames = [
+            self.recompute(self._layers, picture, *inputs)
+            for picture, *inputs in zip(drawn, values.unbind(1), counted.unbind(1), strict=True)
+        ]
+        layers = Layers(*(torch.stack(sums, dim=1) for sums in zip(*frames, strict=True)))
+        every = torch.where(schedule["alpha_curriculum"] > 0.5, CURRICULUM_ALPHA * steps[0].found.shape[1], 0.0)
+        return layers._replace(alpha=layers.alpha + every)
+
+    def _layers(self, drawn: Tensor | None, values: Tensor, counted: Tensor) -> Layers:
+        presence, depth, where, what = values.split([1, 1, 4, self.what], dim=-1)
+        if drawn is None:
+            drawn = self.glimpse_decoder(what)
+        return layers_of(drawn, presence.squeeze(-1), depth.squeeze(-1), window_of(where), counted, self.image_size)
+
+
+def _rendered(step: Step) -> Float[Tensor, "B K D"]:
+    """Presence, depth, place and appearance of a frame's candidates side by side."""
+    new = torch.cat([step.found[..., None], step.proposals.depth, step.proposals.where, step.proposals.what], dim=-1)
+    if step.propagated is None:
+        return joined_candidates(step, None, new)
+    old = step.propagated.objects
+    return joined_candidates(step, torch.cat([old.presence, old.depth, old.where, old.what], dim=-1), new)
+
+
+def joined_candidates(step: Step, propagated: Tensor | None, found: Tensor) -> Tensor:
+    """(B, P, ...) and (B, D, ...) -> (B, P + D, ...); zeros for the P slots of a video's first frame."""
+    if propagated is None:
+        propagated = found.new_zeros(*step.alive.shape, *found.shape[2:])
+    return torch.cat([propagated, found], dim=1)
+
+
+def gaussians(frames: list[Gaussian]) -> Gaussian:
+    """Gaussians of frames (B, ...) -> of the video (B, T, ...)."""
+    return Gaussian(torch.stack([q.mean for q in frames], dim=1), torch.stack([q.std for q in frames], dim=1))

@@ -1,0 +1,82 @@
+"""The background's component decoder: a spatial broadcast decoder whose broadcast map is never made (section 5).
+
+It is the largest computation of a training step.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from apex_lab.models.space.networks import conv_elu, cpu_layout
+from apex_lab.nn.precision import full
+
+
+class BroadcastDecoder(nn.Module):
+    """Spatial broadcast decoder, z_c -> RGB in (0, 1).
+
+    The input is z_c at every pixel of a map 8 pixels larger than the image, plus two channels of coordinates, and four
+    unpadded convolutions bring it to the image's size.
+
+    Args:
+        latent: length of z_c.
+        image_size: side of the image in pixels.
+        width: channels of the convolutions; published: 32.
+    """
+
+    axis: Tensor
+
+    def __init__(self, latent: int, image_size: int, width: int) -> None:
+        super().__init__()
+        self.register_buffer("axis", torch.linspace(-1, 1, image_size + 8), persistent=False)
+        self.first = conv_elu(latent + 2, width, stride=1, padding=0)
+        self.others = nn.Sequential(*(conv_elu(width, width, stride=1, padding=0) for _ in range(3)))
+        self.head = nn.Conv2d(width, 3, 1)
+
+    def forward(self, latent: Float[Tensor, "m latent"]) -> Float[Tensor, "m 3 H W"]:
+        by_latent, by_place = self._first(latent)
+        return torch.sigmoid(self.head(self.others(F.elu_(by_latent[..., None, None] + cpu_layout(by_place)))))
+
+    def _first(self, latent: Tensor) -> tuple[Float[Tensor, "m width"], Float[Tensor, "1 width h w"]]:
+        """`self.first` of the broadcast map, before its ELU, as two summands: of each latent, and of each place.
+
+        A convolution of a constant channel is a constant, and the coordinates are the same for all. The mean and the
+        variance of the sum over latents and places are the sums of theirs, so BatchNorm scales the two before they are
+        added.
+        """
+        conv, norm = self.first[0], self.first[1]
+        assert isinstance(conv, nn.Conv2d)
+        assert isinstance(norm, nn.BatchNorm2d)
+        length = latent.shape[1]
+        y, x = torch.meshgrid(self.axis, self.axis, indexing="ij")
+        with torch.autocast(latent.device.type, enabled=False):
+            weight = conv.weight
+            by_latent = F.linear(full(latent), weight[:, :length].sum((2, 3)), conv.bias)
+            by_place = F.conv2d(torch.stack([x, y])[None], weight[:, length:])
+            if norm.training:
+                mean = by_latent.mean(0) + by_place.mean((0, 2, 3))
+                variance = by_latent.var(0, unbiased=False) + by_place.var((0, 2, 3), unbiased=False)
+                _update(norm, mean, variance, len(latent) * by_place[0, 0].numel())
+            else:
+                mean, variance = _running(norm)
+            gain = norm.weight * torch.rsqrt(variance + norm.eps)
+            return by_latent * gain + (norm.bias - mean * gain), by_place * gain[:, None, None]
+
+
+def _running(norm: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    return norm.running_mean, norm.running_var
+
+
+@torch.no_grad()
+def _update(norm: nn.BatchNorm2d, mean: Tensor, variance: Tensor, count: int) -> None:
+    """What BatchNorm does to its running statistics in training; `variance` is the biased one of `count` values."""
+    running_mean, running_var = _running(norm)
+    assert norm.momentum is not None
+    assert norm.num_batches_tracked is not None
+    running_mean.lerp_(mean, norm.momentum)
+    running_var.lerp_(variance * (count / (count - 1)), norm.momentum)
+    norm.num_batches_tracked.add_(1)
