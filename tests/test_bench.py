@@ -186,12 +186,19 @@ def test_the_parts_are_all_there_and_add_up() -> None:
     for training in (True, False):
         step = work.step(training)
         step()
+        inside: list[float] = []
+
+        def watched(step: Callable[[], object] = step, inside: list[float] = inside) -> None:
+            began = time.perf_counter()
+            step()
+            inside.append(time.perf_counter() - began)
+
         began = time.perf_counter()
-        seconds = seconds_by_part(step, HERE)
+        seconds = seconds_by_part(watched, HERE)
         passed = time.perf_counter() - began
         assert set(seconds) == (INSIDE | {"backward", "update"} if training else INSIDE - {"forward"})
         assert all(value > 0 for value in seconds.values())
-        assert sum(seconds.values()) <= passed
+        assert 0.99 * inside[0] < sum(seconds.values()) <= passed  # the rest is setting up the profiler
 
 
 def test_a_part_s_time_is_without_the_parts_inside_it() -> None:
@@ -227,6 +234,7 @@ def test_writes_a_file_with_every_row(
     [compared] = told["comparisons"]
     assert compared["models"]["model"]["model_trains_times_as_many"] == 1
     assert set(compared["models"]) == {"model", "straightforward", "straightforward, renders as many"}
+    assert all(each["model_trains_times_as_many"] > 0 for each in compared["models"].values())
     assert told["versions"]["torch"] == torch.__version__
     assert told["hardware"]["threads"] == 1
     assert "peak memory" in ended.out
@@ -297,7 +305,7 @@ def refuse_in_child(_: object) -> None:
 
 @pytest.mark.slow
 def test_a_child_that_dies_is_told() -> None:
-    with pytest.raises(UserError, match="ended by SIGKILL, as happens when memory runs out: lower data"):
+    with pytest.raises(UserError, match=r"ended by SIGKILL, as happens when memory runs out: lower clips\.batch_size"):
         child.in_child(kill_this_process, None)
     with pytest.raises(UserError, match=r"^No\.$"):
         child.in_child(refuse_in_child, None)

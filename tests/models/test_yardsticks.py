@@ -15,17 +15,12 @@ from torch import Tensor
 from apex_lab.metrics import SceneMetrics, scene_identities
 from apex_lab.metrics.evaluator import Evaluator
 from apex_lab.models.yardsticks import BackgroundSubtraction, ColorClusters, OneSegment, Oracle
-from apex_lab.models.yardsticks.linking import link
-from apex_lab.scene import ABSENT, Context, SceneModel, Statistics
+from apex_lab.models.yardsticks.linking import Linked, link
+from apex_lab.scene import ABSENT, Context, Scene, SceneModel, Statistics
 
 T, SIZE = 6, 48
 TABLE = torch.tensor([0.55, 0.45, 0.35])
 COLORS = torch.tensor([[0.9, 0.1, 0.1], [0.1, 0.7, 0.2], [0.15, 0.2, 0.9]])
-
-
-def table() -> Statistics:
-    """Of videos in which nothing stands on the table for long."""
-    return Statistics(lambda: TABLE[:, None, None].expand(3, SIZE, SIZE))
 
 
 def squares(seed: int, objects: int = 3) -> tuple[Tensor, Tensor]:
@@ -50,7 +45,7 @@ def batch(videos: int = 3, objects: int = 3) -> tuple[Tensor, Tensor]:
 
 def subtraction(radius: int = 0) -> BackgroundSubtraction:
     model = BackgroundSubtraction(image_size=SIZE, radius=radius)
-    model.initialise(table())
+    model.initialise(table_picture())
     return model
 
 
@@ -67,9 +62,14 @@ def all_yardsticks() -> Iterator[SceneModel]:
     yield Oracle()
 
 
-def run(model: SceneModel, video: Tensor, labels: Tensor):
-    context = Context(detail=True)
+def run(model: SceneModel, video: Tensor, labels: Tensor, context: Context | None = None) -> Scene:
+    context = context or Context(detail=True)
     return model.from_labels(video, labels, context) if model.needs_labels else model(video, context)
+
+
+def table_picture(side: int = SIZE) -> Statistics:
+    """Training statistics whose median is the empty table."""
+    return Statistics(lambda: TABLE[:, None, None].expand(3, side, side))
 
 
 @pytest.mark.parametrize("model", [*learners(), Oracle()], ids=lambda m: type(m).__name__)
@@ -134,7 +134,7 @@ def test_half_precision_changes_nothing(model: SceneModel) -> None:
 def test_one_segment_scores_what_arithmetic_says(objects: int) -> None:
     video, labels = batch(objects=objects)
     scores = SceneMetrics()
-    scores.update(scene_identities(OneSegment()(video, Context(detail=True)), labels.shape[-2:]), labels.long())
+    scores.update(scene_identities(OneSegment()(video, Context()), labels.shape[-2:]), labels.long())
     result = scores.compute()
     share = labels.flatten(2).float().gt(0).float().mean(2)  # of pixels that objects cover
     assert result["msc"] == pytest.approx(1 / (objects + 1), abs=1e-12)
@@ -165,7 +165,7 @@ def test_oracle_scores_all_ones() -> None:
 def test_oracle_refuses_what_it_cannot_know() -> None:
     video, labels = batch(1)
     with pytest.raises(TypeError, match="from_labels"):
-        Oracle()(video, Context(detail=True))
+        Oracle()(video, Context())
     with pytest.raises(ValueError, match=r"labels from 0 to 3.*model\.max_label=3"):
         Oracle(max_label=2).from_labels(video, labels)
     with pytest.raises(ValueError, match="label -1"):
@@ -178,17 +178,17 @@ def test_background_subtraction_carries_its_picture_in_the_checkpoint() -> None:
     video, _ = batch()
     trained, fresh = subtraction(), BackgroundSubtraction(image_size=SIZE, radius=0)
     with pytest.raises(ValueError, match="no median image"):
-        fresh(video, Context(detail=True))
+        fresh(video, Context())
     file = io.BytesIO()
     torch.save(trained.state_dict(), file)
     file.seek(0)
     fresh.load_state_dict(torch.load(file, weights_only=True))
-    assert torch.equal(fresh(video, Context(detail=True)).masks, trained(video, Context(detail=True)).masks)
+    assert torch.equal(fresh(video, Context()).masks, trained(video, Context()).masks)
 
 
 def test_background_subtraction_repaints_a_plain_scene() -> None:
     video, _ = batch()
-    torch.testing.assert_close(subtraction()(video, Context(detail=True)).reconstruction, video)
+    torch.testing.assert_close(subtraction()(video, Context()).reconstruction, video)
 
 
 def test_background_subtraction_refuses_other_sizes() -> None:
@@ -219,10 +219,10 @@ def test_background_subtraction_finds_what_differs_by_more_than_the_threshold() 
 )
 def test_background_subtraction_knows_shadows(color: Tensor, shadow: float, found: bool) -> None:
     model = BackgroundSubtraction(SIZE, threshold=0.07, shadow=shadow, radius=0)
-    model.initialise(table())
+    model.initialise(table_picture())
     video = TABLE[:, None, None].expand(1, 1, 3, SIZE, SIZE).clone()
     video[..., 10:20, 10:20] = color[:, None, None]
-    seen = model(video, Context(detail=True)).segmentation()[0, 0] > 0
+    seen = model(video, Context()).segmentation()[0, 0] > 0
     assert seen.sum() == (100 if found else 0)
 
 
@@ -244,8 +244,8 @@ def test_small_regions_are_no_objects() -> None:
     video[..., 10:12, 10:12] = 0.0  # 4 of 2304 pixels, 0.17 %
     video[..., 30:40, 30:40] = 0.0
     for model in (ColorClusters(min_area=0.01), BackgroundSubtraction(SIZE, radius=0, min_area=0.01)):
-        model.initialise(table())
-        found = model(video, Context(detail=True)).segmentation()[0, 0]
+        model.initialise(table_picture())
+        found = model(video, Context()).segmentation()[0, 0]
         assert found[11, 11] == 0
         assert found[35, 35] == 1
         assert (found > 0).sum() == 100
@@ -255,8 +255,8 @@ def test_only_the_largest_objects_are_kept() -> None:
     video, labels = batch(1)
     areas = labels[0, 0].flatten().bincount()[1:]
     for model in (ColorClusters(colors=4, max_objects=1), BackgroundSubtraction(SIZE, radius=0, max_objects=1)):
-        model.initialise(table())
-        scene = model(video, Context(detail=True))
+        model.initialise(table_picture())
+        scene = model(video, Context())
         assert scene.ids.shape[2] == 2
         assert scene.masks[0, 0, 1].sum() == areas.max()
 
@@ -265,7 +265,7 @@ def test_background_is_the_largest_region_at_the_border() -> None:
     video = torch.zeros(1, 1, 3, SIZE, SIZE)
     video[..., :2, :] = 1.0  # a strip at the border, smaller than what lies inside
     video[..., 4:44, 4:44] = torch.tensor([0.1, 0.3, 0.9])[:, None, None]
-    found = ColorClusters(colors=3)(video, Context(detail=True)).segmentation()[0, 0]
+    found = ColorClusters(colors=3)(video, Context()).segmentation()[0, 0]
     assert found[47, 0] == 0
     assert found[24, 24] > 0
     assert found[0, 0] > 0
@@ -275,7 +275,7 @@ def test_background_is_the_largest_region_at_the_border() -> None:
 @pytest.mark.parametrize("color", [0.0, 0.5, 1.0])
 def test_a_video_of_one_colour_is_background(color: float) -> None:
     video = torch.full((1, 1, 3, SIZE, SIZE), color)
-    assert (ColorClusters()(video, Context(detail=True)).segmentation() == 0).all()
+    assert (ColorClusters()(video, Context()).segmentation() == 0).all()
 
 
 def masks_of(*frames: list[tuple[int, int]]) -> np.ndarray:
@@ -287,35 +287,51 @@ def masks_of(*frames: list[tuple[int, int]]) -> np.ndarray:
     return masks
 
 
+def identities(masks: np.ndarray, colors: np.ndarray, min_similarity: float = 0.3) -> np.ndarray:
+    """What `link` gives for a whole video; cut anywhere, it must give the same from the last frame before the cut."""
+    whole, last = link(masks, colors, min_similarity)
+    for cut in range(1, len(masks)):
+        first, state = link(masks[:cut], colors[:cut], min_similarity)
+        second, state = link(masks[cut:], colors[cut:], min_similarity, state)
+        assert np.array_equal(np.concatenate([first, second]), whole)
+        assert same_frame(state, last)
+    return whole
+
+
+def same_frame(a: Linked, b: Linked) -> bool:
+    fields = (np.array_equal(getattr(a, name), getattr(b, name)) for name in ("masks", "colors", "ids"))
+    return all(fields) and a.free == b.free
+
+
 def test_link_follows_regions_whatever_their_order() -> None:
     masks = masks_of([(0, 5), (10, 15)], [(11, 16), (1, 6)], [(2, 7), (12, 17)])
-    assert link(masks, np.zeros((3, 2, 3)))[0].tolist() == [[1, 2], [2, 1], [1, 2]]
+    assert identities(masks, np.zeros((3, 2, 3))).tolist() == [[1, 2], [2, 1], [1, 2]]
 
 
 def test_link_never_gives_a_number_twice() -> None:
     masks = masks_of([(0, 5), (10, 15)], [(0, 5), (0, 0)], [(0, 5), (10, 15)], [(0, 0), (0, 0)], [(0, 5), (0, 0)])
-    assert link(masks, np.zeros((5, 2, 3)))[0].tolist() == [[1, 2], [1, -1], [1, 3], [-1, -1], [4, -1]]
+    assert identities(masks, np.zeros((5, 2, 3))).tolist() == [[1, 2], [1, -1], [1, 3], [-1, -1], [4, -1]]
 
 
 def test_link_lets_colour_decide_between_equal_overlaps() -> None:
     masks = masks_of([(0, 6)], [(0, 3), (3, 6)])
     red, blue = [0.9, 0.1, 0.1], [0.1, 0.1, 0.9]
     colors = np.array([[red, red], [blue, red]])
-    assert link(masks, colors)[0].tolist() == [[1, -1], [2, 1]]
-    assert link(masks, np.array([[red, red], [red, blue]]))[0].tolist() == [[1, -1], [1, 2]]
+    assert identities(masks, colors).tolist() == [[1, -1], [2, 1]]
+    assert identities(masks, np.array([[red, red], [red, blue]])).tolist() == [[1, -1], [1, 2]]
 
 
 def test_link_needs_overlap_and_likeness() -> None:
     apart = masks_of([(0, 5)], [(5, 10)])
-    assert link(apart, np.zeros((2, 1, 3)))[0].tolist() == [[1], [2]]
+    assert identities(apart, np.zeros((2, 1, 3))).tolist() == [[1], [2]]
     graze = masks_of([(0, 10)], [(9, 19)])  # IoU 1 / 19
     unlike = np.array([[[0.0, 0.0, 0.0]], [[1.0, 1.0, 1.0]]])
-    assert link(graze, unlike)[0].tolist() == [[1], [2]]
-    assert link(graze, np.zeros((2, 1, 3)))[0].tolist() == [[1], [1]]
+    assert identities(graze, unlike).tolist() == [[1], [2]]
+    assert identities(graze, np.zeros((2, 1, 3))).tolist() == [[1], [1]]
 
 
 def test_link_of_nothing() -> None:
-    assert link(np.zeros((3, 0, 4, 4), dtype=bool), np.zeros((3, 0, 3)))[0].shape == (3, 0)
+    assert identities(np.zeros((3, 0, 4, 4), dtype=bool), np.zeros((3, 0, 3))).shape == (3, 0)
 
 
 def test_link_is_the_best_assignment() -> None:
@@ -326,6 +342,6 @@ def test_link_is_the_best_assignment() -> None:
         colors = np.full((2, 4, 3), 0.5)
         iou = [[(a & b).sum() / (a | b).sum() for b in masks[1]] for a in masks[0]]
         best = max(sum(iou[i][j] for i, j in enumerate(order)) for order in permutations(range(4)))
-        ids, _ = link(masks, colors, min_similarity=0.0)
+        ids = identities(masks, colors, min_similarity=0.0)
         pairs = [(i, j) for i, a in enumerate(ids[0]) for j, b in enumerate(ids[1]) if a == b]
         assert sum(iou[i][j] for i, j in pairs) == pytest.approx(best)

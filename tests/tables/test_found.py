@@ -12,8 +12,7 @@ import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.tables.found import SeedRun, collect, read_arrangement
-from apex_lab.training.learner import Learner
-from apex_lab.training.schedules import Constant
+from apex_lab.training.learner import Diverged, Learner
 from apex_lab.training.update import WeightUpdate
 from tests.tables.folders import run_folder
 from tests.tiny import Layers
@@ -54,11 +53,27 @@ def test_outputs_that_are_a_file(tmp_path: Path) -> None:
         collect(tmp_path / "outputs")
 
 
-def test_what_the_learner_says_of_a_loss_that_is_not_finite_makes_a_failed_seed(tmp_path: Path) -> None:
-    update = WeightUpdate(Layers(), {}, {"error": Constant(1.0)}, step=7)
-    update.latest = {"train/loss": torch.tensor(float("nan"))}
-    with pytest.raises(UserError) as error:
-        Learner(update, torch.optim.SGD).fetch()
+def test_a_run_whose_outcome_is_diverged_makes_a_failed_seed(tmp_path: Path) -> None:
+    run_folder(tmp_path, "gswm", 0, status="failed", outcome="diverged", reason="In other words.")
+    run = only(tmp_path)
+    assert (run.state, run.failure) == ("diverged", "its loss was not finite")
+
+
+def test_a_run_of_today_is_judged_by_its_outcome_alone(tmp_path: Path) -> None:
+    reason = "train/loss is nan at step 7 (not finite: train/loss): try a lower optimizer.lr."
+    run_folder(tmp_path, "gswm", 0, status="failed", outcome="failed", reason=reason)
+    run = only(tmp_path)
+    assert (run.state, run.failure) == ("unfinished", None)
+
+
+def test_what_the_learner_says_of_a_loss_that_is_not_finite_makes_a_failed_seed_of_a_run_without_outcome(
+    tmp_path: Path,
+) -> None:
+    """Runs of format 1 record their end as a sentence, which is still that of today."""
+    learner = Learner(WeightUpdate(Layers(), {}, {}, step=7), lambda named: torch.optim.SGD([w for _, w in named]))
+    learner.update.latest = {"train/loss": torch.tensor(float("nan"))}
+    with pytest.raises(Diverged) as error:
+        learner.fetch()
     run_folder(tmp_path, "gswm", 0, status="failed", reason=str(error.value))
     run = only(tmp_path)
     assert (run.state, run.failure) == ("diverged", "its loss was not finite")

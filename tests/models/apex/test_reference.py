@@ -1,8 +1,6 @@
-"""The straightforward variant computes what APEX computes."""
+"""APEX against its naive twin (tests/reference/apex.py), which the benchmark compares it with too."""
 
 from __future__ import annotations
-
-import copy
 
 import pytest
 import torch
@@ -12,44 +10,42 @@ from apex_lab.models.apex import Apex
 from apex_lab.nn.spatial_transformer import Paster, crop
 from apex_lab.scene import Context, schedule_at
 from tests.conftest import compose_job
-from tests.reference.apex import Straightforward
+from tests.reference.apex import Straightforward, twins
 from tests.reference.grid import GridPaster, grid_crop
 
+ALL, AS_MANY = "straightforward", "straightforward, renders as many"
 
-def pair(*words: str, render_top: int | None = None) -> tuple[Apex, Straightforward, Context]:
-    """The tiny APEX, its straightforward variant with the same weights, and the context of some step."""
+
+def pair(*words: str, twin: str = ALL) -> tuple[Apex, Straightforward, Context]:
+    """The tiny APEX, one of its twins with the same weights, and the context of some step."""
     job = compose_job("model=apex", "data=p2d", "scale=smoke", "model.start_presence=0.5", *words)
     model = build_model(job.config)
     assert isinstance(model, Apex)
     with torch.no_grad():
         for p in model.discovery.head_pres.parameters():
             p.mul_(20.0)  # so that some cells propose an object and some do not
-    plain = copy.deepcopy(job.config)
-    plain.model.update(_target_=f"{Straightforward.__module__}.Straightforward", render_top=render_top)
-    variant = build_model(plain)
-    assert isinstance(variant, Straightforward)
-    variant.load_state_dict(model.state_dict())
     schedule = {name: value(3) for name, value in build_schedules(job.config).items()}
-    scales = {"sigma_fg_scale": 2.5, "sigma_bg_scale": 1.6}
-    return model, variant, Context(schedule_at({**schedule, **scales}), detail=True)
+    values = schedule_at({**schedule, "sigma_fg_scale": 2.5, "sigma_bg_scale": 1.6})
+    return model, twins(model, job.config.model)[twin], Context(values, detail=True)
 
 
 VIDEO = torch.rand(3, 4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
 
 
 @pytest.mark.parametrize(
-    "words",
+    ("twin", "words"),
     [
-        (),
-        ("+ablation=image_stn",),
-        pytest.param(("+ablation=gaussian_scalor_norm",), marks=pytest.mark.slow),
-        pytest.param(("model.likelihood.mixture_over=pixel",), marks=pytest.mark.slow),
+        (ALL, ("model.render_top=null",)),
+        (AS_MANY, ()),
+        (ALL, ("model.render_top=null", "+ablation=image_stn")),
+        pytest.param(ALL, ("model.render_top=null", "+ablation=gaussian_scalor_norm"), marks=pytest.mark.slow),
+        pytest.param(ALL, ("model.render_top=null", "model.likelihood.mixture_over=pixel"), marks=pytest.mark.slow),
     ],
-    ids=" ".join,
+    ids=["all", "as many", "all, image_stn", "all, gaussian_scalor_norm", "all, mixture over pixels"],
 )
-def test_the_variant_gives_the_same_terms_masks_and_gradients(words: tuple[str, ...]) -> None:
-    model, variant, context = pair("model.render_top=null", *words)
-    scenes = [each.eval()(VIDEO, context) for each in (model, variant)]
+def test_the_twin_gives_the_same_terms_masks_and_gradients(twin: str, words: tuple[str, ...]) -> None:
+    model, other, context = pair(*words, twin=twin)
+    scenes = [each.eval()(VIDEO, context) for each in (model, other)]
     fast, plain = scenes
     assert (fast.ids[:, :, :-1] > 0).any()
     assert torch.equal(fast.ids, plain.ids)
@@ -61,7 +57,7 @@ def test_the_variant_gives_the_same_terms_masks_and_gradients(words: tuple[str, 
         )
     for scene in scenes:
         torch.stack([term.sum() for term in scene.terms.values()]).sum().backward()
-    for (name, a), b in zip(model.named_parameters(), variant.parameters(), strict=True):
+    for (name, a), b in zip(model.named_parameters(), other.parameters(), strict=True):
         if a.grad is None:
             assert b.grad is None
         else:
@@ -72,15 +68,15 @@ def test_the_variant_gives_the_same_terms_masks_and_gradients(words: tuple[str, 
 
 
 def test_cells_that_hold_nothing_make_no_difference_to_a_rendered_frame() -> None:
-    model, variant, context = pair("model.render_top=6", "model.max_objects=16")
+    model, twin, context = pair("model.render_top=6", "model.max_objects=16")
     last = model.discovery.head_pres[-1]
     assert isinstance(last, torch.nn.Linear)
     present = torch.tensor(16)
     with torch.no_grad():
         while present.max() > 6:  # until no frame has more objects than are rendered
             last.bias.sub_(0.1)
-            variant.load_state_dict(model.state_dict())
-            fast, plain = (each.eval()(VIDEO, context) for each in (model, variant))
+            twin.load_state_dict(model.state_dict())
+            fast, plain = (each.eval()(VIDEO, context) for each in (model, twin))
             present = (plain.ids[:, :, :-1] > 0).sum(-1)
     assert present.max() > 0
     torch.testing.assert_close(fast.terms["nll"], plain.terms["nll"], rtol=2e-5, atol=1e-3)
