@@ -45,7 +45,7 @@ def test_a_checkpoint_alone_is_enough(trained: Path, command: Callable[..., Ende
     assert len(list((tmp_path / "outputs" / "evaluate").glob("shipped_*_test/metrics.json"))) == 1
     # weights of another model, a configuration of another version, files that are no checkpoints
     content = torch.load(alone, weights_only=True)
-    content["config"]["model"]["width"] = 5
+    content["inference"]["model"]["width"] = 5
     torch.save(content, tmp_path / "other.ckpt")
     ended = command("evaluate", "checkpoint=other.ckpt")
     assert ended.code == 1

@@ -22,6 +22,7 @@ def trained_model(inference: Mapping[str, Any]) -> SceneModel:
     Raises:
         UserError: the node builds no model, or the weights do not fit it.
     """
+    components.check(inference["model"], "model")
     with torch.random.fork_rng(devices=[]):
         model = components.build(inference["model"], "model")
     if not isinstance(model, SceneModel):

@@ -10,7 +10,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from apex_lab import components
+from apex_lab.config import components
 from apex_lab.models.gswm import Gswm
 from apex_lab.scene import ABSENT, Scene
 from tests.models.gswm.small import SIZE, context, double, loss, tiny, video

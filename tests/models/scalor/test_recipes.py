@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from apex_lab import components
+from apex_lab.config import components
 from apex_lab.models.scalor import AnchoredSize, FreeSize, Scalor
 
 CONF = Path(__file__).parents[3] / "conf"
