@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ import yaml
 
 from apex_lab.base.errors import UserError
 from apex_lab.config.schema import build_model, conf_dir
-from tests.conftest import REPOSITORY, compose_job
+from tests.conftest import REPOSITORY, Ended, compose_job
 
 
 def words(group: str) -> list[str]:
@@ -33,8 +34,16 @@ def test_every_fragment(group: str) -> None:
     for word in words(group):
         # experiments of the original publications have clips as long as the paper's videos
         scale = "cpu" if group == "ablation" else "paper"
-        job = compose_job("model=apex", f"scale={scale}", "data=p2d", f"+{group}={word}")
+        model = word.removesuffix("_original") if word.endswith("_original") else "apex"
+        job = compose_job(f"model={model}", f"scale={scale}", "data=p2d", f"+{group}={word}")
         assert job.choices[group] == word
+
+
+def test_an_experiment_of_a_model_chooses_it(command: Callable[..., Ended]) -> None:
+    for word in words("experiment"):
+        if word.endswith("_original"):
+            ended = command("train", f"+experiment={word}", "--cfg", "job")
+            assert f"_target_: apex_lab.models.{word.removesuffix('_original')}." in ended.out
 
 
 @pytest.mark.parametrize("group", ["logger", "callbacks", "paths", "data"])
