@@ -22,7 +22,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from apex_lab import bench
 from apex_lab.base.errors import UserError
 from apex_lab.benchmark import child, compare
-from apex_lab.benchmark import rows as report
+from apex_lab.benchmark import printed as report
 from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.profile import REST, seconds_by_part
 from apex_lab.benchmark.work import Workload

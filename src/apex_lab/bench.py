@@ -21,7 +21,7 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json
 from apex_lab.base.validation import shown, validate
-from apex_lab.benchmark import rows as report
+from apex_lab.benchmark import printed as report
 from apex_lab.benchmark.child import in_child
 from apex_lab.benchmark.compare import Comparison, compare, twins_of
 from apex_lab.benchmark.measure import Case, measure

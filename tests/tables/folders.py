@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from apex_lab.tables import spec
+from apex_lab.tables import definition as spec
 from apex_lab.tables.asked import Tables, TablesConfig, assemble
 from apex_lab.tables.build import Built
 from apex_lab.tables.choose import Version

@@ -15,7 +15,8 @@ from typing import Any
 import pytest
 
 from apex_lab.base.files import write_json
-from apex_lab.tables import export, latex, markdown
+from apex_lab.tables import latex, markdown
+from apex_lab.tables import output_files as export
 from apex_lab.tables.build import Built
 from apex_lab.tables.missing_runs import Command
 from tests.tables.folders import made, run_folder

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from apex_lab.data.clips import ClipSampler
-from apex_lab.data.loading import training_loader, whole_loader
+from apex_lab.data.loaders import training_loader, whole_loader
 from apex_lab.data.p2d import P2D
 from apex_lab.data.p2d_source import P2DSource
 from apex_lab.data.source import VideoSource

@@ -28,7 +28,9 @@ from apex_lab.config import command_line as cli
 from apex_lab.config import schema as config
 from apex_lab.runs import folder as runs
 from apex_lab.runs import provenance
-from apex_lab.tables import export, latex, markdown, spec
+from apex_lab.tables import definition as spec
+from apex_lab.tables import latex, markdown
+from apex_lab.tables import output_files as export
 from apex_lab.tables.build import Built, build
 from apex_lab.tables.choose import Choice, Version, choose
 from apex_lab.tables.found import SeedRun, collect

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from apex_lab.tables.choose import Choice, difference
+from apex_lab.tables.definition import Column, Row, Specification, Table
 from apex_lab.tables.found import Protocol
 from apex_lab.tables.rows import DDOF, TRACKING, Line, Options, make_line, rounded
-from apex_lab.tables.spec import Column, Row, Specification, Table
 
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
 

@@ -7,9 +7,9 @@ import unicodedata
 from collections.abc import Sequence
 
 from apex_lab.tables.build import Built
+from apex_lab.tables.definition import Column
 from apex_lab.tables.missing_runs import Command
 from apex_lab.tables.rows import TRACKING, Cell, Line, rounded
-from apex_lab.tables.spec import Column
 
 PREAMBLE = r"""\documentclass{article}
 \usepackage[a4paper,landscape,margin=15mm]{geometry}

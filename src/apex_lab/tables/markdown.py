@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from apex_lab.tables.build import Built
+from apex_lab.tables.definition import Column
 from apex_lab.tables.missing_runs import Command
 from apex_lab.tables.rows import TRACKING, Cell, Line, rounded
-from apex_lab.tables.spec import Column
 
 MISSING, UNDEFINED = "—", "n/a"
 YES, NO = "✓", "✗"

@@ -11,8 +11,8 @@ import numpy as np
 
 from apex_lab.base.errors import UserError
 from apex_lab.tables.choose import Choice
+from apex_lab.tables.definition import Column, Published, Row, Specification, Table
 from apex_lab.tables.found import Protocol, SeedRun, listed, read_arrangement
-from apex_lab.tables.spec import Column, Published, Row, Specification, Table
 
 DDOF = 1
 """Seeds are a sample: deviations divide by n - 1 (metrics.md section 3)."""

@@ -6,11 +6,11 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from apex_lab.view.components import component_panels
 from apex_lab.view.curves import curve_page
 from apex_lab.view.film import film_strip
 from apex_lab.view.item import Item
 from apex_lab.view.movie import movie
+from apex_lab.view.panels import component_panels
 
 
 def render_all(

@@ -12,8 +12,8 @@ import yaml
 from apex_lab.base.errors import UserError
 from apex_lab.config.schema import conf_dir
 from apex_lab.metrics import KEYS
-from apex_lab.tables import spec
-from apex_lab.tables.spec import Table
+from apex_lab.tables import definition as spec
+from apex_lab.tables.definition import Table
 
 SPECIFICATION = spec.load()
 

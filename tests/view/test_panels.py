@@ -14,7 +14,7 @@ from apex_lab.scene import ABSENT, Scene
 from apex_lab.view import Item, component_panels
 from apex_lab.view.canvas import GAP, MARGIN, PAPER
 from apex_lab.view.colors import color_of
-from apex_lab.view.components import (
+from apex_lab.view.panels import (
     _BACKGROUND_TONE,
     _CAPTION,
     _GROUP_GAP,

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from apex_lab.tables.build import Built
+from apex_lab.tables.definition import Column
 from apex_lab.tables.markdown import label, ours
 from apex_lab.tables.missing_runs import Command
 from apex_lab.tables.rows import DDOF, TRACKING, Cell, Line, Summary
-from apex_lab.tables.spec import Column
 
 
 def as_json(tables: Sequence[Built], commands: Sequence[Command], problems: Sequence[str]) -> dict[str, Any]:
