@@ -1,4 +1,4 @@
-"""Speed of P2D's simulation, compared with a straightforward scene: `python -m sims.p2d.bench`.
+"""Speed of P2D's simulation, compared with a straightforward scene: `python -m sims.p2d.bench_simulation`.
 
 The naive scene is one PyBullet server per process, reset and loaded again for every trajectory, with the Panda's own
 meshes, the scans at full resolution, PyBullet's plane and table, and one `getCameraImage` with shadows per frame. It
@@ -130,7 +130,9 @@ def measure(settings: Settings, trajectories: int) -> tuple[Clock, Clock]:
 
 def main() -> None:
     """Print the speeds, their ratio, and the time for the whole data set."""
-    parser = argparse.ArgumentParser(prog="python -m sims.p2d.bench", description=(__doc__ or "").split("\n\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m sims.p2d.bench_simulation", description=(__doc__ or "").split("\n\n")[0]
+    )
     parser.add_argument("--trajectories", type=int, default=12, help="trajectories to time (default 12)")
     parser.add_argument("--image-size", type=int, default=128, help="side of the images in pixels (default 128)")
     parser.add_argument("--renderer", choices=["tiny", "egl"], default="tiny", help="renderer of P2D (default tiny)")

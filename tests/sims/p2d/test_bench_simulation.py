@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("pybullet")
 
-from sims.p2d import bench
+from sims.p2d import bench_simulation as bench
 from sims.p2d.settings import Settings
 
 
