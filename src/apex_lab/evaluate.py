@@ -51,17 +51,14 @@ class EvaluateConfig(BaseModel):
     chunk: int | None = Field(default=None, ge=1)
     data: dict[str, Any] = Field(default_factory=dict)
     seed: int = Field(default=0, ge=0)
+    trust: bool = False
     scoring: ScoringPart
     paths: config.PathsPart
 
 
 OF_CHECKPOINTS: dict[str, Any] = {
-    "videos": None,
-    "export": None,
-    "folder": None,
-    "again": False,
-    "data": {},
-    "chunk": None,
+    **{"videos": None, "export": None, "folder": None, "again": False},
+    **{"data": {}, "chunk": None, "trust": False},
 }
 OF_PREDICTIONS = {"format": None, "truth": None, "partial": False, "resize": None, "output": None}
 """Keys of one kind of evaluation alone, with their defaults."""
@@ -118,7 +115,7 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
         raise UserError("checkpoint = [] names no file: give a .ckpt file or a run folder.")
     given = [word.lstrip("+").partition("=")[0] for word in overrides if word.lstrip("+").startswith("data.")]
     data = OtherData(asked.data, tuple(key.removeprefix("data.") for key in given))
-    jobs = {file: load(file, asked.paths, data)[1] for file in files}
+    jobs = {file: load(file, asked.paths, data, asked.trust)[1] for file in files}
     if asked.scoring.masks == "posterior":
         without = [str(file) for file, job in jobs.items() if not config.build_model(job.config).has_posterior]
         if without:
@@ -177,6 +174,7 @@ def _request(asked: EvaluateConfig, data: OtherData) -> Request:
         data=data,
         batch_size=asked.batch_size,
         chunk=asked.chunk,
+        trust=asked.trust,
     )
 
 

@@ -20,7 +20,7 @@ from apex_lab.base.files import read_json
 from apex_lab.base.interrupts import Deferred, Interrupted, deferring
 from apex_lab.base.validation import one_line
 from apex_lab.config import command_line as cli
-from apex_lab.config import components
+from apex_lab.config import components, trust
 from apex_lab.config.schema import Job, build_model, build_schedules, check_job
 from apex_lab.config.schema import device as device_of
 from apex_lab.config.upgrades import fingerprint
@@ -180,9 +180,10 @@ def _show(run: Run) -> None:
 def _checkpoint(run: Run) -> dict[str, Any] | None:
     """What to resume from; a damaged last checkpoint is reported, and the one before it taken."""
     paths = [path for path in (run.last, checkpoints.previous(run.last)) if path.exists()]
+    known = [str(name) for _, name in trust.targets(run.job.raw)]  # the user's own configuration
     for path in paths:
         try:
-            return checkpoints.load(path)
+            return checkpoints.load(path, known=known)
         except UserError as error:
             console.warn(str(error))
     if paths:

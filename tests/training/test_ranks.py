@@ -18,7 +18,13 @@ from apex_lab.base.errors import UserError
 from apex_lab.training.ranks import Ranks, given, started
 from tests.conftest import REPOSITORY, TINY
 
-WORDS = (*TINY, "trainer.max_steps=20", "trainer.log_interval=1", "trainer.validation_interval=10")
+WORDS = (
+    *TINY,
+    "trainer.max_steps=20",
+    "trainer.log_interval=1",
+    "trainer.validation_interval=10",
+    "trainer.checkpoint_interval=2",
+)
 
 
 def start(folder: Path, *words: str, pause: float = 0.0) -> subprocess.Popen[str]:
@@ -75,7 +81,7 @@ def test_two_processes_train_what_one_trains(one_process: Path, tmp_path: Path) 
 
 @pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGTERM])
 def test_killed_and_resumed_they_end_as_unbroken(one_process: Path, tmp_path: Path, kill: signal.Signals) -> None:
-    process = start(tmp_path, "trainer.devices=2", pause=0.2)
+    process = start(tmp_path, "trainer.devices=2", pause=0.1)
     for _ in range(2000):
         records = [json.loads(path.read_text()) for path in tmp_path.glob("outputs/*/seed_0/run.json")]
         if records and records[0]["steps"] >= 4:

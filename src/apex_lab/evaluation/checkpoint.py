@@ -53,6 +53,7 @@ class Request:
     data: OtherData = field(default_factory=OtherData)
     batch_size: int = 4
     chunk: int | None = None
+    trust: bool = False
 
 
 def find(patterns: Sequence[str]) -> list[Path]:
@@ -73,18 +74,21 @@ def find(patterns: Sequence[str]) -> list[Path]:
     return list(found.values())
 
 
-def load(file: Path, paths: config.PathsPart, data: OtherData | None = None) -> tuple[dict[str, Any], config.Job]:
+def load(
+    file: Path, paths: config.PathsPart, data: OtherData | None = None, trusted: bool = False
+) -> tuple[dict[str, Any], config.Job]:
     """A checkpoint and the checked configuration that made it, with the folders of this machine.
 
     Args:
         file: the checkpoint.
         paths: folders of this machine.
         data: what stands in place of the data that the model was trained with.
+        trusted: build whatever the checkpoint names, not only the project's own components.
 
     Raises:
         UserError: the file is no usable checkpoint, or the data's settings do not fit.
     """
-    content = checkpoints.load(file)
+    content = checkpoints.load(file, trusted)
     stored = content["config"]
     old, new = stored["paths"]["data"], paths.data
     own = {key: new if value == old else value for key, value in stored["data"].items()}
@@ -112,7 +116,7 @@ def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
     Raises:
         UserError: the checkpoint does not fit, or another process works on it.
     """
-    content, job = load(file, request.paths, request.data)
+    content, job = load(file, request.paths, request.data, request.trust)
     try:
         model = trained_model(content["inference"])
     except UserError as error:

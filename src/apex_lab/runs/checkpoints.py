@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import pickle
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import replacing, unwritable
-from apex_lab.config import components
+from apex_lab.config import components, trust
 from apex_lab.config.schema import Config, build_schedules
 from apex_lab.config.upgrades import FORMAT, upgraded
 from apex_lab.scene import SceneModel
@@ -78,11 +79,16 @@ def previous(path: Path) -> Path:
     return path.with_name(f"previous{path.suffix}")
 
 
-def load(path: Path) -> dict[str, Any]:
+def load(path: Path, trusted: bool = False, known: Iterable[str] = ()) -> dict[str, Any]:
     """Reads a checkpoint to the CPU and checks that it is whole (every stored block has a checksum).
 
+    Args:
+        path: the file.
+        trusted: it may name any class; else only the project's own (`apex_lab.config.trust`).
+        known: names of further classes that are allowed.
+
     Raises:
-        UserError: missing, damaged, or no checkpoint of ours.
+        UserError: missing, damaged, no checkpoint of ours, or one that names classes that are not allowed.
     """
     if not path.is_file():
         raise UserError(f"There is no checkpoint at {path}.")
@@ -107,7 +113,10 @@ def load(path: Path) -> dict[str, Any]:
         )
     if set(content) != _KEYS[content["format"]]:
         raise UserError(f"{path} is no apex_lab checkpoint: give a .ckpt file of a run, or the run's folder.")
-    content = _upgraded(content)
+    config = upgraded(content["config"], content["format"])
+    if not trusted:
+        trust.check({"config": config, "inference": {"model": _inside(content).get("model")}}, str(path), known)
+    content = _upgraded({**content, "config": config})
     weights = content["inference"]["weights"]
     sick = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
     if sick:
@@ -121,10 +130,10 @@ def _inside(content: dict[str, Any]) -> dict[str, Any]:
 
 
 def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
-    """A checkpoint of an older format in today's layout."""
+    """A checkpoint of an older format, whose configuration is upgraded, in today's layout."""
     if content["format"] == FORMAT:
         return content
-    config, step = upgraded(content["config"], content["format"]), content["step"]
+    config, step = content["config"], content["step"]
     schedules = {name: components.build(node, f"schedule.{name}") for name, node in config["schedule"].items()}
     return {
         "format": FORMAT,
