@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -22,6 +23,7 @@ from torch.distributions import Normal, kl_divergence
 
 from apex_lab.models.gswm import Gswm
 from apex_lab.scene import Context
+from tests.reference.adapter import Twin
 
 
 def perceptron(*sizes: int) -> nn.Sequential:
@@ -422,3 +424,14 @@ class Naive(nn.Module):
             first = sorted(range(t - 1), key=draws.__getitem__)[:count]
             yes[i, 1:] = torch.tensor([k in first for k in range(t - 1)])
         return yes
+
+
+def twins(model: Gswm, node: Mapping[str, Any]) -> dict[str, Twin]:
+    """The twin that the benchmark trains, with the weights of `model`, which `node` has built."""
+    naive = Naive(model)
+
+    def terms(video: Tensor, context: Context) -> dict[str, Tensor]:
+        found = naive(video, context)
+        return {name: found[name] for name in model.term_names}
+
+    return {"straightforward": Twin(model, naive, terms)}

@@ -8,7 +8,9 @@ is written out frame by frame.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -16,6 +18,7 @@ from torch import Tensor
 
 from apex_lab.models.op3 import Op3
 from apex_lab.scene import Noise
+from tests.reference.adapter import Twin
 
 
 @dataclass
@@ -204,3 +207,9 @@ def norm(x: Tensor, weights: torch.nn.Module, epsilon: float, dims: int) -> Tens
     axes = tuple(range(-dims, 0))
     scale, shift = (p.reshape(-1, *[1] * (dims - 1)) for p in (weights.scale, weights.shift))
     return (x - x.mean(axes, keepdim=True)) / (x.std(axes, keepdim=True) + epsilon) * scale + shift
+
+
+def twins(model: Op3, node: Mapping[str, Any]) -> dict[str, Twin]:
+    """The twin that the benchmark trains, with the weights of `model`, which `node` has built."""
+    naive = NaiveOp3(model)
+    return {"straightforward": Twin(model, model, lambda video, context: naive(video, context.noise).terms)}

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -17,6 +18,7 @@ from torch import Tensor, nn
 
 from apex_lab.models.scalor import AnchoredSize, Scalor
 from apex_lab.scene import Noise
+from tests.reference.adapter import Twin
 
 
 @dataclass
@@ -396,3 +398,13 @@ class NaiveScalor(nn.Module):
         ids = [[k for _, k in mine] for mine in kept]
         after["ids"] = torch.tensor([row + [-1] * (longest - len(row)) for row in ids]).reshape(b, longest, 1)
         return after, ids, next_id, [[j for j, _ in mine] for mine in kept]
+
+
+def twins(model: Scalor, node: Mapping[str, Any]) -> dict[str, Twin]:
+    """The twin that the benchmark trains, with the weights of `model`, which `node` has built."""
+    naive = NaiveScalor(model)
+    return {
+        "straightforward": Twin(
+            model, naive, lambda video, context: naive(video, context.schedule, context.noise).terms
+        )
+    }

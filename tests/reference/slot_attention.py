@@ -7,10 +7,15 @@ is copied to the whole grid before the decoder. Takes the weights of a model und
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+
+from apex_lab.models.slot_attention import SlotAttention
+from apex_lab.scene import Context
+from tests.reference.adapter import Twin
 
 Weights = Mapping[str, Tensor]
 
@@ -107,3 +112,16 @@ def explain(
         losses.append(loss)
     shape = video.shape[:2]
     return torch.stack(masks).unflatten(0, shape), torch.stack(slots).unflatten(0, shape), torch.stack(losses)
+
+
+def twins(model: SlotAttention, node: Mapping[str, Any]) -> dict[str, Twin]:
+    """The twin that the benchmark trains, with the weights of `model`, which `node` has built."""
+
+    def terms(video: Tensor, context: Context) -> dict[str, Tensor]:
+        b, t = video.shape[:2]
+        weights = dict(model.named_parameters())
+        noise = context.noise.normal(video.new_empty(b, t, model.slots, len(weights["grouping.mu"])))
+        _, _, loss = explain(video, noise, weights, node.get("variant", "released"), model.iterations)
+        return {"mse": loss}
+
+    return {"straightforward": Twin(model, model, terms)}

@@ -8,6 +8,7 @@ draws and the names of loss terms are shared with the model.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -16,6 +17,7 @@ from torch import Tensor, nn
 
 from apex_lab.models.space import Space
 from apex_lab.scene import Context, Scene
+from tests.reference.adapter import Twin
 
 
 def celu(cin: int, cout: int, k: int, s: int, p: int, groups: int) -> list[nn.Module]:
@@ -306,3 +308,13 @@ class NaiveSpace(nn.Module):
 def relative_error(found: Tensor, expected: Tensor) -> float:
     """Largest difference, relative to the largest expected magnitude."""
     return ((found - expected).abs().max() / expected.abs().max().clamp_min(1e-12)).item()
+
+
+def twins(model: Space, node: Mapping[str, Any]) -> dict[str, Twin]:
+    """The twin that the benchmark trains, with the weights of `model`; none for glimpses of other sizes than 32."""
+    if node.get("glimpse_size", 32) != 32:
+        return {}
+    names = ("sigma_fg", "sigma_bg", "scale_std", "decoder_width")
+    sizes = {name: node[name] for name in names if name in node}
+    naive = NaiveSpace(model, model.image_size, node["grid"], node["components"], **sizes)
+    return {"straightforward": Twin(model, naive, lambda video, context: naive(video, context).terms)}
