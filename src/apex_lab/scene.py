@@ -158,6 +158,9 @@ class SceneModel(nn.Module):
     has_posterior: bool = False
     """True for models whose likelihood is a mixture over components, so that `posterior` can be called."""
 
+    batch_statistics: bool = False
+    """True for models that normalise over the batch in training, so that what a video gives depends on the others."""
+
     input_size: tuple[int, int] | None = None
     """(H, W) in pixels for a model built for one size: videos are resized to it, masks back. None: any size."""
 

@@ -49,6 +49,14 @@ def test_a_new_key_at_its_old_value_changes_no_fingerprint(with_dummy_key: None)
     assert fingerprint(other) != fingerprint(raw)
 
 
+def test_a_key_in_a_new_section_changes_no_fingerprint(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw = compose_job().raw
+    monkeypatch.setitem(ADDED, "augment.flip", False)
+    assert fingerprint({**raw, "augment": {"flip": False}}) == fingerprint(raw)
+    assert fingerprint({**raw, "augment": {"flip": 0}}) != fingerprint(raw)  # 0 is not False
+    assert fingerprint({**raw, "augment": {"flip": True}}) != fingerprint(raw)
+
+
 @pytest.mark.usefixtures("with_dummy_key")
 def test_with_a_new_key_a_finished_run_is_found(command: Callable[..., Ended], tmp_path: Path) -> None:
     shutil.copytree(OLD, tmp_path / "outputs" / OLD.name)
@@ -100,6 +108,10 @@ def test_an_unfinished_run_of_format_1_resumes(command: Callable[..., Ended], tm
     assert "resuming from step 48" in ended.out
     assert json.loads((run / "run.json").read_text())["format"] == FORMAT
     assert checkpoints.load(run / "checkpoints" / "last.ckpt")["step"] == 50
+    # it keeps its folder for good
+    ended = command("train", *WORDS)
+    assert ended.out.startswith("finished already: outputs/apex_p2d_smoke_c2ea6a76/seed_0")
+    assert len(list((tmp_path / "outputs").iterdir())) == 1
 
 
 def test_a_configuration_of_format_1_has_todays_keys() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import default_collate
 
-from apex_lab.inference.predictor import Predictor
+from apex_lab.inference.predictor import Predictor, joined
 from apex_lab.inference.sizes import fitted, fitted_back
 from apex_lab.scene import ABSENT, Context, Scene, SceneModel
 from tests.tiny import Squares
@@ -111,3 +112,11 @@ def test_resizing_is_antialiased_and_keeps_the_range() -> None:
     assert fitted(stripes, (32, 32)) is stripes
     scene = Small()(torch.rand(1, 1, 3, 8, 8), Context())
     assert fitted_back(scene, (8, 8)) is scene
+
+
+def test_diagnostics_that_some_chunks_lack_are_means_of_the_others() -> None:
+    one, two = (predict([0], chunk=3) for _ in range(2))
+    first = dataclasses.replace(one, diagnostics={"both": torch.tensor(1.0)})
+    later = dataclasses.replace(two, diagnostics={"both": torch.tensor(3.0), "later": torch.tensor(5.0)})
+    whole = joined([first, later])
+    assert {name: float(value) for name, value in whole.diagnostics.items()} == {"both": 2.0, "later": 5.0}

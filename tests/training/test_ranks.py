@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.training.ranks import Ranks, given, started
-from tests.conftest import REPOSITORY, TINY
+from tests.conftest import REPOSITORY, TINY, Ended
 
 WORDS = (
     *TINY,
@@ -126,6 +127,26 @@ def test_a_batch_that_cannot_be_shared_is_refused(tmp_path: Path) -> None:
     assert process.returncode == 2
     assert "clips.batch_size = 2 is the global batch, which 3 processes" in errors
     assert not list(tmp_path.glob("outputs/*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("model=space", "clips.batch_size=4"), "but this model normalises over the batch"),
+        (("model=gswm", "clips.batch_size=2"), "but this model normalises over the batch"),
+        (
+            ("model=apex", "trainer.validation_videos=1"),
+            "1 validation videos (data.val, trainer.valid",
+        ),
+    ],
+)
+def test_what_two_processes_cannot_do_is_refused(
+    words: tuple[str, ...], sentence: str, command: Callable[..., Ended]
+) -> None:
+    ended = command("train", "data=sprites", "scale=smoke", "trainer.devices=2", *words)
+    assert ended.code == 2
+    assert sentence in ended.err
+    assert len(ended.err.splitlines()) == 1
 
 
 def test_a_launcher_says_which_rank_this_is(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

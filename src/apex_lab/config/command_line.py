@@ -23,6 +23,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -70,9 +71,11 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
         except UserError as error:
             console.error(str(error))
             failures.append((name, one_line(error)))
+            _tell_launcher(name, one_line(error))
         except Exception as error:  # noqa: BLE001 - reported below; the other jobs of a sweep must still run
             traceback.print_exc()
             failures.append((name, f"{type(error).__name__}: {one_line(error)}"))
+            _tell_launcher(name, f"{type(error).__name__}: {one_line(error)}")
 
     sys.argv[1:] = _full_names(_options_last(sys.argv[1:]))
     if config_name == "evaluate":
@@ -94,6 +97,23 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
             for name, reason in failures:
                 console.error(f"  {name}: {reason}")
         sys.exit(RUN_ERROR)
+
+
+class JobFailed(RuntimeError):
+    """A job of a sweep failed in a process of its own."""
+
+
+def _tell_launcher(name: str, reason: str) -> None:
+    """Fails the job towards launchers that run it in another process, which does not share our list of failures.
+
+    Hydra hands the failure back in the job's return, so the exit code is right under every launcher.
+
+    Raises:
+        JobFailed: the launcher is not Hydra's basic one.
+    """
+    config = HydraConfig.get()
+    if config.mode == RunMode.MULTIRUN and not config.launcher._target_.endswith(".BasicLauncher"):
+        raise JobFailed(f"{name}: {reason}")
 
 
 def _preflight(config_name: str, check: Check) -> None:

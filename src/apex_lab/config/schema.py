@@ -337,19 +337,36 @@ def _check_objective(config: Config) -> None:
         build_optimizer(config, [(name, p) for name, p in model.named_parameters() if p.requires_grad])
         _check_monitor(config.trainer, model)
         _check_clips(config)
+        _check_ranks(config, model)
 
 
-def _check_clips(config: Config) -> None:
-    """Batches that can be shared among the ranks, clips of at least a frame."""
+def _check_ranks(config: Config, model: SceneModel) -> None:
+    """Several processes must be able to give the result of one."""
     ranks = config.trainer.devices * config.trainer.num_nodes
+    if ranks == 1:
+        return
     if config.clips.batch_size % ranks:
         raise UserError(
             f"clips.batch_size = {config.clips.batch_size} is the global batch, which {ranks} processes "
             "(trainer.devices x trainer.num_nodes) cannot share equally: choose a multiple."
         )
+    if model.batch_statistics:
+        raise UserError(
+            f"trainer.devices x trainer.num_nodes = {ranks}, but this model normalises over the batch, and shares of a "
+            "batch have other statistics: set both to 1."
+        )
+    counts = [count for count in (config.data.get("val"), config.trainer.validation_videos) if isinstance(count, int)]
+    if config.trainer.validation_interval is not None and counts and min(counts) < ranks:
+        raise UserError(
+            f"{min(counts)} validation videos (data.val, trainer.validation_videos) are too few for {ranks} processes: "
+            "raise them, or set trainer.validation_interval=null."
+        )
+
+
+def _check_clips(config: Config) -> None:
+    """Clips of at least a frame, and not longer than videos."""
     frames, longest = build_clip_frames(config), config.data.get("frames")
-    last = config.trainer.max_steps
-    for step in [*range(0, last, max(1, last // 1000)), last]:
+    for step in range(config.trainer.max_steps) if isinstance(config.clips.frames, dict) else (0,):
         wanted = frames(step)
         if wanted is None:
             continue

@@ -81,7 +81,8 @@ def fingerprint(config: Mapping[str, Any]) -> str:
         for key in ("trainer", "clips", "lr_scale"):
             _remove(content, key)
     for key, before in ADDED.items():
-        if _value(content, key) == before:
+        value = _value(content, key)
+        if value == before and type(value) is type(before):
             _remove(content, key)
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(canonical.encode()).hexdigest()
@@ -122,5 +123,7 @@ def _value(content: Mapping[str, Any], key: str) -> Any:
 def _remove(content: dict[str, Any], key: str) -> None:
     parent, _, last = key.rpartition(".")
     holder = _value(content, parent) if parent else content
-    if isinstance(holder, dict):
-        holder.pop(last, None)
+    if isinstance(holder, dict) and last in holder:
+        holder.pop(last)
+        if not holder and parent:  # a section that came with the key
+            _remove(content, parent)

@@ -59,12 +59,13 @@ class ClipSampler(Sampler[list[Clip]]):
         each = batch_size // ranks
         self.mine = slice(rank * each, (rank + 1) * each)
         self._order = lru_cache(maxsize=2)(self._draw)
-        for step in {start, *range(start, stop, max(1, (stop - start) // 1000)), max(stop - 1, start)}:
+        shortest = min(lengths, default=0)
+        for step in range(start, stop) if frames is not whole_videos else ():
             wanted = frames(step)
-            if wanted is not None and wanted > min(lengths, default=0):
+            if wanted is not None and wanted > shortest:
                 raise UserError(
                     f"clips.frames is {wanted} at step {step}, but the shortest training video has "
-                    f"{min(lengths, default=0)} frames: lower clips.frames or raise data.frames."
+                    f"{shortest} frames: lower clips.frames or raise data.frames."
                 )
 
     def batch(self, step: int) -> list[Clip]:

@@ -90,6 +90,12 @@ class Predictor:
         return fitted_back(scene, (video.shape[-2], video.shape[-1]))
 
 
+def _averaged(found: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """Mean of each value over the chunks that have it."""
+    names = dict.fromkeys(name for each in found for name in each)
+    return {name: torch.stack([each[name] for each in found if name in each]).mean(0) for name in names}
+
+
 def joined(scenes: Sequence[Scene]) -> Scene:
     """Scenes of consecutive chunks of the same videos -> the scene of all their frames.
 
@@ -107,9 +113,7 @@ def joined(scenes: Sequence[Scene]) -> Scene:
     return Scene(
         background=last.background,
         terms={name: torch.stack([scene.terms[name] for scene in scenes]).sum(0) for name in last.terms},
-        diagnostics={
-            name: torch.stack([scene.diagnostics[name] for scene in scenes]).mean(0) for name in last.diagnostics
-        },
+        diagnostics=_averaged([scene.diagnostics for scene in scenes]),
         state=last.state,
         **{name: over_time(name) for name in names},
     )

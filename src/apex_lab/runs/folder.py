@@ -55,7 +55,10 @@ def _words(job: Job) -> str:
 def _same_run(folder: Path, job: Job) -> bool:
     """Whether a folder that an older version of apex_lab named holds this job's run."""
     try:
-        format = read_json(folder / RECORD).get("format", 1)
+        record = read_json(folder / RECORD)
+        format = record.get("format", 1)
+        if format == FORMAT:  # begun by an older version, resumed by this one
+            return record.get("fingerprint") == fingerprint(job.raw)
         if not isinstance(format, int) or not 1 <= format < FORMAT:
             return False
         stored = yaml.safe_load((folder / "config.yaml").read_text())

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,7 +90,10 @@ def started(job: dict[str, Any], devices: int, nodes: int, folder: Path) -> Iter
                     subprocess.Popen(command, env={**os.environ, **common, **threads, **own}, stdin=subprocess.PIPE)
                 )
             os.environ.update({**common, "RANK": "0", "LOCAL_RANK": "0", "NODE_RANK": "0"})
-            yield Ranks(0, devices)
+            try:
+                yield Ranks(0, devices)
+            except RuntimeError as error:
+                raise _death(workers) or error from error
             for worker in workers:
                 worker.wait(timeout=60)
         finally:
@@ -99,6 +102,19 @@ def started(job: dict[str, Any], devices: int, nodes: int, folder: Path) -> Iter
                 worker.wait()
             os.environ.clear()
             os.environ.update(before)
+
+
+def _death(workers: Sequence[subprocess.Popen[bytes]]) -> UserError | None:
+    """What ended the processes that are gone, which the others only notice by a closed connection."""
+    time.sleep(1.0)
+    for rank, worker in enumerate(workers, start=1):
+        code = worker.poll()
+        if code is not None:
+            how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+            return UserError(
+                f"The process of rank {rank} ended with {how}: see its messages above; the same command resumes."
+            )
+    return None
 
 
 def job_file(folder: Path) -> Path:

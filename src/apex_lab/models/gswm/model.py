@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, NamedTuple
 import torch
 from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor
+from torch import Tensor, nn
 
 from apex_lab.models.gswm.background import Backdrop, Background, BackgroundState
 from apex_lab.models.gswm.discovery import Discovering, Discovery, Draw, Posterior, discovering
@@ -150,6 +150,7 @@ class Gswm(SceneModel):
         side = image_size if environment == "whole" else glimpse_size
         self.history = History(1 + self.each, hidden, environment, environment_margin, side, glimpse_widths)
         self.renderer = Renderer(what, glimpse_size, glimpse_widths[::-1], image_size)
+        self.batch_statistics = any(isinstance(module, nn.BatchNorm2d) for module in self.modules())
 
     def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
         """Infers a video.

@@ -49,6 +49,7 @@ class Space(SceneModel):
         "fixed_alpha": (0.0, 1.0),
     }
     tracks = False
+    batch_statistics = True  # BatchNorm in the background
 
     def __init__(
         self,
