@@ -53,7 +53,9 @@ def ask(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureF
     usual["batch_size"] = 2
 
     def run(*words: str) -> Ended:
-        asked = OmegaConf.merge(usual, OmegaConf.from_dotlist(list(words)))
+        # the models are those of tests/tiny.py
+        trust = {} if any(word.startswith("predictions=") for word in words) else {"trust": True}
+        asked = OmegaConf.merge(usual, trust, OmegaConf.from_dotlist(list(words)))
         assert isinstance(asked, DictConfig)
         capsys.readouterr()
         code = CONFIG_ERROR

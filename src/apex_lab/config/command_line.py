@@ -62,6 +62,7 @@ def launch(config_name: str, check: Check, work: Callable[[Any], None], title: C
     def task(config: DictConfig) -> None:
         nonlocal jobs
         jobs += 1
+        console.setup()  # the launcher may have put this job into a process of its own
         overrides = list(HydraConfig.get().overrides.task)
         name = " ".join(overrides)
         try:
