@@ -124,7 +124,9 @@ def fit(
 
 def _some_unused(config: Config, update: WeightUpdate) -> bool:
     """Whether a step may leave parameters without gradients: a term without weight, clips too short for propagation."""
-    return len(update.weights.schedules) < len(update.terms) or config.clips.frames is not None
+    weights, steps = update.weights.schedules, range(update.step, config.trainer.max_steps)
+    weightless = len(weights) < len(update.terms) or any(w(step) == 0 for w in weights.values() for step in steps)
+    return weightless or config.clips.frames is not None
 
 
 def resume_at(trainer: L.Trainer, step: int) -> None:

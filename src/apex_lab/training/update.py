@@ -61,8 +61,8 @@ class WeightUpdate(nn.Module):
     Args:
         model: trained in place.
         schedules: the values of `Context.schedule`.
-        weights: loss term -> its weight. A weight that is 0 at every step takes its term out, even where it is not
-            finite.
+        weights: loss term -> its weight. A weight of 0 takes its term out, even where it is not finite (in a captured
+            graph only a weight that is 0 at every step).
         lr_scale: factor of all of the optimiser's learning rates.
         clip_norm: gradients of all parameters together are scaled down to this norm; None leaves them.
         seed: of the noise.
@@ -103,7 +103,10 @@ class WeightUpdate(nn.Module):
         """
         if sorted(terms) != self.terms:
             raise UserError(f"The model gives the loss terms {sorted(terms)}, loss has {self.terms}.")
-        return torch.stack([terms[name].mean() * weight for name, weight in self.weights.tensors().items()]).sum()
+        # a captured graph is the same at every step; elsewhere a weight of 0 takes its term out of the step
+        captured = self.mode == "cuda graph"
+        live = [name for name, weight in self.weights.schedules.items() if captured or weight(self.step) != 0]
+        return torch.stack([terms[name].mean() * self.weights[name] for name in live]).sum()
 
     def write(self, optimizer: Optimizer | None = None) -> None:
         """Brings schedules, loss weights and learning rates to the present step."""
