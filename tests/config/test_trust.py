@@ -58,7 +58,9 @@ def test_hostile_names_are_refused(name: Any) -> None:
     ],
 )
 def test_the_projects_own_components_are_allowed(name: str) -> None:
-    trust.check({"a": [{"b": {"_target_": name}}]}, "x.ckpt")
+    config = {"a": [{"b": {"_target_": name}}]}
+    trust.check(config, "x.ckpt")
+    assert list(trust.targets(config)) == [("a[0].b._target_", name)]
 
 
 def test_every_shipped_component_is_allowed() -> None:
