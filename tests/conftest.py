@@ -21,7 +21,8 @@ import tests.typechecked
 # Shapes and types of every call are checked in all tests; so the hook comes before the first import of apex_lab.
 install_import_hook("apex_lab", f"{tests.typechecked.__name__}.checked")
 
-from apex_lab.config.schema import Job, check_job, conf_dir, plain  # noqa: E402
+from apex_lab.config.composition import conf_dir, plain  # noqa: E402
+from apex_lab.config.schema import Job, check_job  # noqa: E402
 
 # A shell without job control starts background jobs deaf to Ctrl-C, and processes that tests start would inherit that.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -76,7 +76,7 @@ class Evaluation:
 
 def main() -> None:
     """Entry point: `python -m apex_lab.evaluate`."""
-    cli.launch("evaluate", check_evaluation, evaluate, title)
+    cli.launch(cli.Command("evaluate", check_evaluation, evaluate, title))
 
 
 def title(job: Evaluation) -> str:

@@ -21,7 +21,7 @@ from apex_lab.base.interrupts import Deferred, Interrupted, deferring
 from apex_lab.base.validation import one_line
 from apex_lab.config import command_line as cli
 from apex_lab.config import components, trust
-from apex_lab.config.schema import Job, build_model, build_schedules, check_job
+from apex_lab.config.schema import Job, build_model, build_schedules, check_job, reseeded
 from apex_lab.config.schema import device as device_of
 from apex_lab.config.upgrades import fingerprint
 from apex_lab.data import VideoSource, whole_loader
@@ -29,6 +29,7 @@ from apex_lab.inference.predictor import Predictor
 from apex_lab.inference.sizes import fitted
 from apex_lab.runs import checkpoints
 from apex_lab.runs.folder import Outcome, Run, group_name, run_folder
+from apex_lab.runs.state import beating, read_state
 from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
 from apex_lab.training import estimate, ranks, worker
@@ -39,7 +40,9 @@ from apex_lab.training.loggers import Curves, Wandb
 
 def main() -> None:
     """Entry point: `python -m apex_lab.train`."""
-    cli.launch("train", check_job, train, title)
+    cli.launch(
+        cli.Command("train", check_job, train, title, known=lambda job: read_state(run_folder(job)), reseeded=reseeded)
+    )
 
 
 def title(job: Job) -> str:
@@ -64,7 +67,7 @@ def train(job: Job) -> None:
             return
         device = device_of(job.config.trainer.accelerator)
         run.start(cli.command_line(), device)
-        with console.log_to(run.folder / "log.txt"):
+        with beating(run.folder), console.log_to(run.folder / "log.txt"):
             try:
                 _train(run, device)
             except BaseException as error:

@@ -9,7 +9,8 @@ import pytest
 import yaml
 
 from apex_lab.base.errors import UserError
-from apex_lab.config.schema import build_model, conf_dir
+from apex_lab.config.composition import conf_dir
+from apex_lab.config.schema import build_model
 from tests.conftest import REPOSITORY, Ended, compose_job
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
-from apex_lab.config import schema as config
+from apex_lab.config import composition
 from apex_lab.runs import folder as runs
 from tests.conftest import Ended
 from tests.tables.folders import run_folder
@@ -34,8 +34,8 @@ def test_a_dry_run_on_an_empty_folder_prints_empty_tables_and_every_command(
 
 
 def fingerprint(*words: str) -> str:
-    with initialize_config_dir(version_base="1.3", config_dir=str(config.conf_dir())):
-        return runs.fingerprint(config.plain(compose("train", overrides=list(words))))
+    with initialize_config_dir(version_base="1.3", config_dir=str(composition.conf_dir())):
+        return runs.fingerprint(composition.plain(compose("train", overrides=list(words))))
 
 
 def test_tables_are_printed_stored_and_their_paths_told(tables: Callable[..., Ended], tmp_path: Path) -> None:

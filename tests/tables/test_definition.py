@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from apex_lab.base.errors import UserError
-from apex_lab.config.schema import conf_dir
+from apex_lab.config.composition import conf_dir
 from apex_lab.metrics import KEYS
 from apex_lab.tables import definition as spec
 from apex_lab.tables.definition import Table

@@ -1,7 +1,7 @@
 """From the words on the command line to checked jobs: what all entry points share.
 
-Hydra composes, expands sweeps and launches. Before it starts, every job of the command is composed and checked here, so
-that the third of four jobs' misspelt value is found before the first one starts, `++` included.
+Hydra composes and launches. Before it starts, every job of the command is composed and checked here, so that the third
+of four jobs' misspelt value is found before the first one starts, `++` included.
 """
 
 from __future__ import annotations
@@ -11,114 +11,126 @@ import re
 import shlex
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra import compose, initialize_config_dir
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra import compose
 from hydra._internal.utils import get_args_parser
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base import console
-from apex_lab.base.errors import UserError
+from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.interrupts import Interrupted, interruptible
 from apex_lab.base.validation import did_you_mean, one_line, sentence
-from apex_lab.config.schema import conf_dir, plain
+from apex_lab.config.composition import (
+    CHOICES,
+    Composed,
+    chosen,
+    composed,
+    composing,
+    conf_dir,
+    full_names,
+    not_there,
+    plain,
+)
+from apex_lab.config.job_list import expand
+from apex_lab.config.sweeps import Item, JobBusy, JobFailed, Known, Sweep
 
 Check = Callable[[dict[str, Any], dict[str, str], Sequence[str]], Any]
 """(plain configuration, group -> word, overrides) -> a checked job; raises UserError."""
-
-CHOICES = ("model", "ablation", "data", "scale", "experiment")
-"""Groups that name a run; a run has one choice of each."""
 
 CONFIG_ERROR = 2
 RUN_ERROR = 1
 
 
-def launch(config_name: str, check: Check, work: Callable[[Any], None], title: Callable[[Any], str]) -> None:
-    """Runs an entry point: checks every job of the command line, then runs them one after another.
+@dataclass(frozen=True)
+class Command:
+    """What an entry point does.
+
+    Attributes:
+        config_name: file in conf/ without its ending.
+        check: turns a composed configuration into a job.
+        work: does one job; returns how it ended where that is not "finished" (`apex_lab.runs.folder.Outcome`).
+        title: a job in a few words, for the list of what failed.
+        known: the state of a job that was not started; None where jobs leave nothing behind that could be looked at.
+        reseeded: the job of another seed of a checked configuration; None where seeds are checked like other jobs.
+    """
+
+    config_name: str
+    check: Check
+    work: Callable[[Any], str | None]
+    title: Callable[[Any], str]
+    known: Callable[[Any], Known] | None = None
+    reseeded: Callable[[Any, Composed], Any] | None = None
+
+
+def launch(command: Command) -> None:
+    """Runs an entry point: checks every job of the command line, then runs them.
 
     A job that fails does not stop the next ones. Ends the process with exit code 0, 1 (a job failed), 2 (the command or
     its configuration is wrong; nothing was started) or 128 + n (stopped by signal n).
-
-    Args:
-        config_name: file in conf/ without its ending.
-        check: turns a composed configuration into a job.
-        work: does one job.
-        title: a job in a few words, for the list of what failed.
     """
     console.setup()
-    failures: list[tuple[str, str]] = []
-    jobs = 0
+    failed = False
 
-    def task(config: DictConfig) -> None:
-        nonlocal jobs
-        jobs += 1
+    def task(config: DictConfig) -> str:
         console.setup()  # the launcher may have put this job into a process of its own
         overrides = list(HydraConfig.get().overrides.task)
-        name = " ".join(overrides)
         try:
-            job = check(plain(config), _choices(HydraConfig.get().runtime), overrides)
-            name = title(job)
-            work(job)
+            job = command.check(plain(config), chosen(HydraConfig.get().runtime), overrides)
+            return command.work(job) or "finished"
+        except Busy as error:
+            _fail(JobBusy(str(error)), str(error))
         except UserError as error:
-            console.error(str(error))
-            failures.append((name, one_line(error)))
-            _tell_launcher(name, one_line(error))
+            _fail(JobFailed(one_line(error)), str(error))
         except Exception as error:  # noqa: BLE001 - reported below; the other jobs of a sweep must still run
             traceback.print_exc()
-            failures.append((name, f"{type(error).__name__}: {one_line(error)}"))
-            _tell_launcher(name, f"{type(error).__name__}: {one_line(error)}")
+            _fail(JobFailed(f"{type(error).__name__}: {one_line(error)}"))
+        return "failed"
 
-    sys.argv[1:] = _full_names(_options_last(sys.argv[1:]))
-    if config_name == "evaluate":
+    def _fail(error: JobFailed | JobBusy, message: str | None = None) -> None:
+        """Reports a failure to whoever has started the job."""
+        if message is not None and not (swept() and isinstance(error, JobBusy)):
+            console.error(message)
+        if swept():
+            raise error  # comes back through Hydra's job return
+        nonlocal failed
+        failed = True
+
+    def swept() -> bool:
+        return HydraConfig.get().mode == RunMode.MULTIRUN
+
+    sys.argv[1:] = full_names(_options_last(sys.argv[1:]))
+    if command.config_name == "evaluate":
         # the checkpoint brings the data's settings, so no file here has them; the check knows which exist
         sys.argv[1:] = [f"++{word}" if word.startswith("data.") else word for word in sys.argv[1:]]
     try:
         with interruptible():
-            _preflight(config_name, check)
-            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=config_name)(task)()
+            task.sweep = sweep = Sweep(_preflight(command), command.known)  # type: ignore[attr-defined]
+            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=command.config_name)(task)()
     except UserError as error:
         console.error(str(error))
         sys.exit(CONFIG_ERROR)
     except Interrupted as stop:
         console.error(f"Stopped by {stop}; the same command resumes from here.")
         sys.exit(128 + stop.signum)
-    if failures:
-        if jobs > 1:
-            console.error(f"{len(failures)} of {jobs} failed:")
-            for name, reason in failures:
-                console.error(f"  {name}: {reason}")
+    sweep.report()
+    if failed or sweep.failures:
         sys.exit(RUN_ERROR)
 
 
-class JobFailed(RuntimeError):
-    """A job of a sweep failed in a process of its own."""
-
-
-def _tell_launcher(name: str, reason: str) -> None:
-    """Fails the job towards launchers that run it in another process, which does not share our list of failures.
-
-    Hydra hands the failure back in the job's return, so the exit code is right under every launcher.
-
-    Raises:
-        JobFailed: the launcher is not Hydra's basic one.
-    """
-    config = HydraConfig.get()
-    if config.mode == RunMode.MULTIRUN and not config.launcher._target_.endswith(".BasicLauncher"):
-        raise JobFailed(f"{name}: {reason}")
-
-
-def _preflight(config_name: str, check: Check) -> None:
+def _preflight(command: Command) -> list[Item]:
     """Composes and checks every job of the command line, unless it only asks for help or for the configuration.
+
+    Returns:
+        The jobs of a sweep; none where it is no sweep.
 
     Raises:
         UserError: what Hydra or the check refuses, in one sentence.
@@ -127,46 +139,63 @@ def _preflight(config_name: str, check: Check) -> None:
     if arguments.multirun and (arguments.cfg or arguments.info):
         raise UserError("-m cannot stand beside --cfg or --info: leave it out to see one job's configuration.")
     if arguments.help or arguments.hydra_help or arguments.info or arguments.shell_completion or arguments.cfg:
-        return
+        return []
     extra = []
     if arguments.config_dir is not None:
         if not Path(arguments.config_dir).is_dir():
             raise UserError(f"--config-dir {arguments.config_dir} is not a folder.")
         extra = [f"hydra.searchpath=[file://{Path(arguments.config_dir).resolve()}]"]
-    name = arguments.config_name or config_name
-    GlobalHydra.instance().clear()
+    name = arguments.config_name or command.config_name
+    overrides = arguments.overrides
+    with composing(overrides, arguments.config_path):
+        _check_hydra_keys(name, extra, overrides)
+        _check_groups(command.config_name, overrides)
+        if not (arguments.multirun or "hydra.mode=MULTIRUN" in overrides):
+            _checked(command, name, extra, [tuple(overrides)])
+            return []
+        if any(word.startswith("hydra/sweeper=") for word in overrides):
+            return []  # another sweeper chooses its values as it goes; each of its jobs is checked when it starts
+        jobs = expand([*_swept_by_files(name, extra, overrides), *overrides], extra)
+        return _checked(command, name, extra, jobs)
+
+
+def _swept_by_files(name: str, extra: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    """What configuration files sweep by `hydra.sweeper.params`, as words of a command line."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    groups = [str(o.input_line) for o in parsed if o.key_or_group in CHOICES and not o.is_sweep_override()]
+    config = compose(name, overrides=[*extra, *groups], return_hydra_config=True)
+    return [f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()]
+
+
+def _checked(command: Command, name: str, extra: Sequence[str], jobs: Sequence[tuple[str, ...]]) -> list[Item]:
+    """Composes and checks jobs; one that only differs in its seed from another is not built again."""
+    first: dict[tuple[str, ...], Any] = {}
+    items = []
+    for made in _composed(command, name, extra, jobs):
+        rest = tuple(word for word in made.words if not word.startswith("seed="))
+        if command.reseeded is None or rest not in first:
+            first[rest] = command.check(made.raw, made.choices, made.words)
+            job = first[rest]
+        else:
+            job = command.reseeded(first[rest], made)
+        items.append(Item(made.words, job, command.title(job)))
+    return items
+
+
+def _composed(command: Command, name: str, extra: Sequence[str], jobs: Sequence[tuple[str, ...]]) -> Iterator[Composed]:
+    """Composes jobs; the sentence on a key that no file sets says whether it exists and what is close to it."""
     try:
-        with initialize_config_dir(version_base="1.3", config_dir=arguments.config_path or str(conf_dir())):
-            _check_hydra_keys(name, extra, arguments.overrides)
-            _check_groups(config_name, arguments.overrides)
-            sweep = arguments.multirun or "hydra.mode=MULTIRUN" in arguments.overrides
-            for overrides in _expand(arguments.overrides) if sweep else [arguments.overrides]:
-                _check_composed(name, extra, overrides, check)
-    except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(_told(error, arguments.overrides)) from error
-    finally:
-        GlobalHydra.instance().clear()
-
-
-def _check_composed(name: str, extra: Sequence[str], overrides: Sequence[str], check: Check) -> None:
-    """Composes one job and checks it."""
-
-    def attempt(words: Sequence[str]) -> None:
-        config = compose(name, overrides=[*extra, *words], return_hydra_config=True)
-        choices = _choices(config.hydra.runtime)
-        own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-        check(plain(own), choices, overrides)
-
-    try:
-        attempt(overrides)
+        yield from composed(name, jobs, extra)
     except HydraException as error:
-        absent = re.match(r"Could not override '([^']+)'\.\s+To append to your config", str(error))
-        if absent is None:
+        key = not_there(error)
+        if key is None:
             raise
-        # Hydra only knows that no file sets the key; the check knows whether it exists and what is close to it
-        key = absent.group(1)
-        attempt([f"++{word}" if word.startswith(f"{key}=") else word for word in overrides])
-        word = next(word for word in overrides if word.startswith(f"{key}="))
+        job = next(job for job in jobs if any(word.startswith(f"{key}=") for word in job))
+        # Hydra only knows that no file sets the key; the check knows whether it exists
+        added = [f"++{word}" if word.startswith(f"{key}=") else word for word in job]
+        for made in composed(name, [added], extra):
+            command.check(made.raw, made.choices, made.words)
+        word = next(word for word in job if word.startswith(f"{key}="))
         raise UserError(f"{key} is set by no file that was chosen: write ++{word} to add it.") from error
 
 
@@ -213,40 +242,6 @@ def _check_groups(command: str, overrides: Sequence[str]) -> None:
         given[key] = word
 
 
-def _expand(overrides: Sequence[str]) -> list[list[str]]:
-    """The jobs of a sweep, as Hydra's own sweeper makes them."""
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    if any(override.key_or_group == "hydra/sweeper" for override in parsed):
-        # another sweeper chooses its values as it goes; each of its jobs is checked when it starts
-        fixed = [o for o in parsed if not o.is_sweep_override()]
-        return [[str(o.input_line) for o in fixed]]
-    return [job for batch in BasicSweeper.split_arguments(parsed, None) for job in batch]
-
-
-def _choices(runtime: Any) -> dict[str, str]:
-    """The words chosen on the command line or by default; Hydra's own groups, and a recipe without a file, left out."""
-    choices = runtime.choices.items()
-    found = {str(k): str(v) for k, v in choices if not str(k).startswith("hydra/") and v is not None}
-    folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
-    if not any((folder / "recipe" / f"{found.get('recipe')}.yaml").is_file() for folder in folders):
-        found.pop("recipe", None)
-    return found
-
-
-SHORT = {name: f"model/apex/{name}" for name in ("likelihood", "masks", "glimpses")}
-"""Short word -> group: APEX's swappable parts may be chosen by the last part of their names."""
-
-
-def _full_names(arguments: Sequence[str]) -> list[str]:
-    """The same words with the full names of groups."""
-
-    def full(word: str) -> str:
-        key, equals, value = word.partition("=")
-        return f"{SHORT[key]}={value}" if equals and key in SHORT else word
-
-    return [full(word) for word in arguments]
-
-
 def _options_last(arguments: Sequence[str]) -> list[str]:
     """The same command line with all overrides in one piece, so that `-m` may stand anywhere."""
     known, rest = get_args_parser().parse_known_args(list(arguments))
@@ -258,36 +253,6 @@ def _options_last(arguments: Sequence[str]) -> list[str]:
     for word in [*early, *late]:
         options.remove(word)
     return [*early, *late, *options]
-
-
-def _told(error: Exception, overrides: Sequence[str]) -> str:
-    """A message of Hydra or OmegaConf of several lines, as one sentence with the key, the value and what to do."""
-    text = str(error)
-    given = {word.split("=", 1)[0].lstrip("+~"): word.lstrip("+~") for word in overrides}
-    if isinstance(error, MissingConfigException) and error.options is not None:
-        group, _, word = str(error.missing_cfg_file).rpartition("/")
-        guess = did_you_mean(word, error.options)
-        return sentence(f"{group}={word}: there is no such choice in {', '.join(error.options)}{guess}")
-    several = re.match(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
-    if several:
-        key, values = several.groups()
-        if key.lstrip("+") in CHOICES:
-            return f"{key}={values} holds several values: add -m to run them all."
-        return f"{key}={values} holds several values: add -m to run them all, or write {key}=[{values}] for a list."
-    if isinstance(error, OverrideParseException):
-        return sentence(f"'{error.override}' cannot be read as key=value: {text.splitlines()[0]}")
-    unlisted = re.match(r"(?:In '([^']+)': )?Could not override '([^']+)'\.\s+No match in the defaults list", text)
-    if unlisted:
-        inside, group = unlisted.groups()
-        if inside or group in SHORT.values():
-            chosen = inside.replace("/", "=") if inside else given.get(group, group)
-            part = group.rpartition("/")[2]
-            return f"{chosen} swaps APEX's {part}, and no APEX is chosen here: add model=apex."
-        return f"{given.get(group, group)} has no default to replace: write +{given.get(group, group)}."
-    there = re.match(r"Could not append to config\. An item is already at '([^']+)'", text)
-    if there:
-        return f"{there.group(1)} is there already: write {given.get(there.group(1), there.group(1))} without the +."
-    return sentence(text)
 
 
 def command_line() -> str:

@@ -1,41 +1,26 @@
-"""Where the configuration lies, what it may hold, and how a composed one is checked before anything starts."""
+"""What a configuration may hold, and how a composed one is checked before anything starts."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
 from apex_lab.config import components
 from apex_lab.config.components import is_node
+from apex_lab.config.composition import Composed, conf_dir
 from apex_lab.data.source import VideoSource
 from apex_lab.scene import SceneModel
 from apex_lab.training.schedules import Constant
 
 VALIDATION_SCORES = ("ari_fg", "msc_fg", "ari", "msc", "mota", "match")
 """Scores that validation puts into the curves; those of tracking only for models that track."""
-
-
-def conf_dir() -> Path:
-    """The folder of configuration files: inside the installed package, else the repository's.
-
-    Raises:
-        UserError: neither is there (a damaged installation).
-    """
-    package = Path(__file__).resolve().parent.parent
-    for folder in (package / "conf", package.parent.parent / "conf"):
-        if (folder / "train.yaml").is_file():
-            return folder
-    raise UserError(f"No configuration files at {package / 'conf'}: install apex_lab again.")
 
 
 class _Part(BaseModel):
@@ -140,21 +125,6 @@ class Job:
     overrides: tuple[str, ...] = ()
 
 
-def plain(config: DictConfig) -> dict[str, Any]:
-    """A composed configuration as plain containers, all interpolations resolved; `???` stays where a value is missing.
-
-    Raises:
-        UserError: an interpolation leads nowhere.
-    """
-    try:
-        container = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
-    except OmegaConfBaseException as error:
-        key = f"{error.full_key}: " if error.full_key else ""
-        raise UserError(sentence(key + str(error.msg).splitlines()[0])) from error
-    assert isinstance(container, dict)
-    return {str(key): value for key, value in container.items()}
-
-
 def refuse_missing(raw: Mapping[str, Any], prefix: str = "") -> None:
     """Looks for values that a file leaves to the command line.
 
@@ -186,6 +156,8 @@ def check_job(
         UserError: the sentence.
     """
     raw = {key: value for key, value in raw.items() if key != "hydra"}
+    if "sweep" in raw:
+        raise UserError(f"+sweep={choices.get('sweep', '...')} lists several jobs: add -m to run them.")
     groups = [folder.name for folder in conf_dir().iterdir() if folder.is_dir()]
     config = validate(Config, raw, "", also_known=groups)
     assert isinstance(config, Config)
@@ -197,6 +169,17 @@ def check_job(
     _check_splits(config)
     _check_cuda_graph(config.trainer)
     return Job(config, raw, dict(choices), tuple(overrides))
+
+
+def reseeded(job: Job, made: Composed) -> Job:
+    """The job of another seed of a configuration that `check_job` has passed.
+
+    Raises:
+        UserError: it is no seed.
+    """
+    config = validate(Config, made.raw, "")
+    assert isinstance(config, Config)
+    return Job(config, made.raw, job.choices, made.words)
 
 
 def device(accelerator: str) -> torch.device:

@@ -24,11 +24,12 @@ import torch
 import yaml
 from filelock import FileLock, Timeout
 
-from apex_lab.base.errors import UserError
+from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import make_folder, read_json, write_json, write_text
 from apex_lab.config.schema import Job
 from apex_lab.config.upgrades import FORMAT, fingerprint, upgraded
 from apex_lab.runs import provenance
+from apex_lab.runs.state import LOCK, RECORD
 
 
 def group_name(job: Job) -> str:
@@ -67,8 +68,6 @@ def _same_run(folder: Path, job: Job) -> bool:
         return False  # damaged, so it cannot be recognised
 
 
-RECORD = "run.json"
-
 Outcome = Literal["finished", "failed", "interrupted", "diverged"]
 """How a run's last attempt ended; null in the record while it is running."""
 
@@ -90,7 +89,7 @@ class Run:
     def __init__(self, job: Job) -> None:
         self.job = job
         self.folder = run_folder(job)
-        self._lock = FileLock(str(self.folder / ".lock"))
+        self._lock = FileLock(str(self.folder / LOCK))
         self.record = {}
 
     def __enter__(self) -> Run:
@@ -103,7 +102,7 @@ class Run:
         try:
             self._lock.acquire(blocking=False)
         except Timeout as error:
-            raise UserError(f"{self.folder} is being worked on by another process: wait for it or stop it.") from error
+            raise Busy(f"{self.folder} is being worked on by another process: wait for it or stop it.") from error
         except OSError as error:
             raise UserError(
                 f"{self.folder} cannot be written ({error.strerror}): choose another paths.outputs."

@@ -26,6 +26,7 @@ from apex_lab.base.files import make_folder, write_json, write_text
 from apex_lab.base.validation import shown, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import schema as config
+from apex_lab.config.composition import plain
 from apex_lab.runs import folder as runs
 from apex_lab.runs import provenance
 from apex_lab.tables import definition as spec
@@ -99,7 +100,7 @@ def main() -> None:
         console.setup()
         console.error(str(error))
         sys.exit(cli.CONFIG_ERROR)
-    cli.launch("tables", check_tables, make_tables, lambda job: f"tables of {job.data}, {job.scale}")
+    cli.launch(cli.Command("tables", check_tables, make_tables, lambda job: f"tables of {job.data}, {job.scale}"))
 
 
 def check_tables(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str]) -> Tables:
@@ -191,7 +192,7 @@ def this_version() -> Version:
 
     def fingerprint(words: Sequence[str]) -> str | None:
         try:
-            raw = config.plain(compose("train", overrides=list(words)))
+            raw = plain(compose("train", overrides=list(words)))
         except (HydraException, OmegaConfBaseException, UserError):
             return None  # this version has no such configuration; the row notes it
         return runs.fingerprint(raw)

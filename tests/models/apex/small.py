@@ -12,7 +12,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from torch import Tensor, nn
 
-from apex_lab.config.schema import conf_dir, plain
+from apex_lab.config.composition import conf_dir, plain
 from apex_lab.models.apex import (
     Apex,
     ApexEncoder,

@@ -1,0 +1,186 @@
+"""Composes configurations by Hydra, and turns what Hydra refuses into one sentence. Imports no PyTorch.
+
+Seeds of one configuration differ in one number, so a list of jobs is composed once per configuration.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from apex_lab.base.errors import UserError
+from apex_lab.base.validation import did_you_mean, sentence
+
+CHOICES = ("model", "ablation", "data", "scale", "experiment", "tuned")
+"""Groups that name a run; a run has one choice of each."""
+
+SHORT = {name: f"model/apex/{name}" for name in ("likelihood", "masks", "glimpses")}
+"""Short word -> group: APEX's swappable parts may be chosen by the last part of their names."""
+
+
+@dataclass(frozen=True)
+class Composed:
+    """One configuration as Hydra composes it.
+
+    Attributes:
+        raw: plain containers, all interpolations resolved, without Hydra's own part.
+        choices: group -> the word chosen for it.
+        words: the overrides that made it.
+    """
+
+    raw: dict[str, Any]
+    choices: dict[str, str]
+    words: tuple[str, ...]
+
+
+def conf_dir() -> Path:
+    """The folder of configuration files: inside the installed package, else the repository's.
+
+    Raises:
+        UserError: neither is there (a damaged installation).
+    """
+    package = Path(__file__).resolve().parent.parent
+    for folder in (package / "conf", package.parent.parent / "conf"):
+        if (folder / "train.yaml").is_file():
+            return folder
+    raise UserError(f"No configuration files at {package / 'conf'}: install apex_lab again.")
+
+
+def plain(config: DictConfig) -> dict[str, Any]:
+    """A composed configuration as plain containers, all interpolations resolved; `???` stays where a value is missing.
+
+    Raises:
+        UserError: an interpolation leads nowhere.
+    """
+    try:
+        container = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
+    except OmegaConfBaseException as error:
+        key = f"{error.full_key}: " if error.full_key else ""
+        raise UserError(sentence(key + str(error.msg).splitlines()[0])) from error
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items()}
+
+
+def chosen(runtime: Any) -> dict[str, str]:
+    """The words chosen on the command line or by default; Hydra's own groups, and a recipe without a file, left out.
+
+    Args:
+        runtime: the `hydra.runtime` part of a composed configuration.
+    """
+    choices = runtime.choices.items()
+    found = {str(k): str(v) for k, v in choices if not str(k).startswith("hydra/") and v is not None}
+    folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
+    if not any((folder / "recipe" / f"{found.get('recipe')}.yaml").is_file() for folder in folders):
+        found.pop("recipe", None)
+    return found
+
+
+def full_names(words: Sequence[str]) -> list[str]:
+    """The same words with the full names of groups."""
+
+    def full(word: str) -> str:
+        key, equals, value = word.partition("=")
+        return f"{SHORT[key]}={value}" if equals and key in SHORT else word
+
+    return [full(word) for word in words]
+
+
+@contextmanager
+def composing(overrides: Sequence[str], folder: str | None = None) -> Iterator[None]:
+    """Inside, Hydra composes from the project's files; what it refuses becomes a sentence.
+
+    Args:
+        overrides: the words of the command line, which the sentences cite.
+        folder: of configuration files, instead of the project's.
+
+    Raises:
+        UserError: Hydra or OmegaConf refused something.
+    """
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(version_base="1.3", config_dir=folder or str(conf_dir())):
+            yield
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(told(error, overrides)) from error
+    finally:
+        GlobalHydra.instance().clear()
+
+
+def composed(
+    name: str,
+    jobs: Sequence[Sequence[str]],
+    extra: Sequence[str] = (),
+) -> Iterator[Composed]:
+    """Composes jobs in their order; to be called inside `composing`.
+
+    Args:
+        name: the file in conf/ without its ending.
+        jobs: the words of each.
+        extra: words for Hydra that belong to all, such as a search path.
+    """
+    templates: dict[tuple[str, ...], tuple[DictConfig, dict[str, str]]] = {}
+    for words in jobs:
+        rest = tuple(word for word in words if not word.startswith("seed="))
+        if rest not in templates:
+            templates[rest] = _template(name, [*extra, *words])
+        config, choices = templates[rest]
+        for word in words:
+            if word.startswith("seed="):
+                OmegaConf.update(config, "seed", OverridesParser.create().parse_override(word).value())
+        yield Composed(plain(config), choices, tuple(words))
+
+
+def _template(name: str, words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
+    """An unresolved configuration and its choices."""
+    config = compose(name, overrides=list(words), return_hydra_config=True)
+    choices = chosen(config.hydra.runtime)
+    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    OmegaConf.set_struct(own, False)
+    return own, choices
+
+
+def not_there(error: Exception) -> str | None:
+    """The key that no chosen file sets, where that is what Hydra refuses."""
+    found = re.match(r"Could not override '([^']+)'\.\s+To append to your config", str(error))
+    return found.group(1) if found else None
+
+
+def told(error: Exception, overrides: Sequence[str]) -> str:
+    """A message of Hydra or OmegaConf of several lines, as one sentence with the key, the value and what to do."""
+    text = str(error)
+    given = {word.split("=", 1)[0].lstrip("+~"): word.lstrip("+~") for word in overrides}
+    if isinstance(error, MissingConfigException) and error.options is not None:
+        group, _, word = str(error.missing_cfg_file).rpartition("/")
+        guess = did_you_mean(word, error.options)
+        return sentence(f"{group}={word}: there is no such choice in {', '.join(error.options)}{guess}")
+    several = re.match(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)
+    if several:
+        key, values = several.groups()
+        if key.lstrip("+") in CHOICES:
+            return f"{key}={values} holds several values: add -m to run them all."
+        return f"{key}={values} holds several values: add -m to run them all, or write {key}=[{values}] for a list."
+    if isinstance(error, OverrideParseException):
+        return sentence(f"'{error.override}' cannot be read as key=value: {text.splitlines()[0]}")
+    unlisted = re.match(r"(?:In '([^']+)': )?Could not override '([^']+)'\.\s+No match in the defaults list", text)
+    if unlisted:
+        inside, group = unlisted.groups()
+        if inside or group in SHORT.values():
+            choice = inside.replace("/", "=") if inside else given.get(group, group)
+            part = group.rpartition("/")[2]
+            return f"{choice} swaps APEX's {part}, and no APEX is chosen here: add model=apex."
+        return f"{given.get(group, group)} has no default to replace: write +{given.get(group, group)}."
+    there = re.match(r"Could not append to config\. An item is already at '([^']+)'", text)
+    if there:
+        return f"{there.group(1)} is there already: write {given.get(there.group(1), there.group(1))} without the +."
+    return sentence(text)

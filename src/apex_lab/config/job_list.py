@@ -1,0 +1,127 @@
+"""From the words of one command to the words of its jobs.
+
+`seed=0,1 model.grid=4,8` is a product. `+sweep=<name>` is a list: conf/sweep/<name>.yaml names entries, each a product
+of its own, and what they make together is the sweep:
+
+    jobs:
+      - {model: [apex, space], seed: [0, 1, 2, 3]}          # eight jobs
+      - {model: apex, +ablation: no_entropy, seed: [0, 1]}  # two more
+    include: [tracking]                                     # and those of another sweep
+
+Keys stand as on the command line. A key that the command gives too has the command's values in every entry.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hydra import compose
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from omegaconf import OmegaConf
+from pydantic import BaseModel, ConfigDict
+
+from apex_lab.base.errors import UserError
+from apex_lab.base.validation import validate
+
+Words = tuple[str, ...]
+
+Value = str | int | float | bool | None
+
+
+class SweepFile(BaseModel):
+    """What a file in conf/sweep/ may hold."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    jobs: tuple[dict[str, Value | tuple[Value, ...]], ...] = ()
+    include: tuple[str, ...] = ()
+
+
+def expand(overrides: Sequence[str], extra: Sequence[str] = ()) -> list[Words]:
+    """The jobs of a command line with `-m`, each as the words that compose it, in the order in which they run.
+
+    To be called where Hydra is initialised. Words for Hydra itself are left out.
+
+    Args:
+        overrides: the words of the command.
+        extra: words for Hydra with which sweep files are found, such as a search path.
+
+    Raises:
+        UserError: a sweep file is not there or damaged; an interval, which has no list of values.
+        HydraException: a word cannot be read.
+    """
+    given: dict[str, list[str]] = {}
+    sweeps: list[str] = []
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        key = override.get_key_element()
+        if key.lstrip("+~").startswith(("hydra.", "hydra/")):
+            continue
+        if override.key_or_group == "sweep":
+            sweeps += _values(override)
+        elif override.is_delete() and override.value() is None:
+            given[key] = [key]
+        else:
+            given[key] = [f"{key}={value}" for value in _values(override)]
+    if not sweeps:
+        return [tuple(job) for job in itertools.product(*given.values())]
+    jobs: list[Words] = []
+    for name in sweeps:
+        for entry in read_sweep(name, extra):
+            jobs += _product(entry, given)
+    return list({frozenset(job): job for job in jobs}.values())
+
+
+def _product(entry: Mapping[str, Sequence[str]], given: Mapping[str, Sequence[str]]) -> list[Words]:
+    """The jobs of one entry under a command's own words."""
+    replaced = {key.lstrip("+") for key in given}
+    kept = {key: words for key, words in entry.items() if key.lstrip("+") not in replaced}
+    return [tuple(job) for job in itertools.product(*kept.values(), *given.values())]
+
+
+def _values(override: Override) -> list[str]:
+    """All values of one word as they stand on a command line."""
+    if not override.is_sweep_override():
+        return [override.get_value_element_as_str()]
+    if not override.is_discrete_sweep():
+        raise UserError(
+            f"{override.input_line} is an interval, which has no list of values: name them, or search by apex_lab.tune."
+        )
+    return list(override.sweep_string_iterator())
+
+
+def read_sweep(name: str, extra: Sequence[str] = (), seen: Words = ()) -> list[dict[str, list[str]]]:
+    """The entries of a sweep file and of those that it includes: key -> the words of its values.
+
+    Raises:
+        UserError: it is not there, includes itself, or holds what it may not.
+    """
+    if name in seen:
+        raise UserError(f"conf/sweep/{seen[0]}.yaml includes itself ({' > '.join([*seen, name])}).")
+    node = OmegaConf.to_container(compose("train", overrides=[*extra, f"+sweep={name}"]).sweep, resolve=False)
+    described = f"conf/sweep/{name}.yaml"
+    file = validate(SweepFile, node if isinstance(node, dict) else {"": node}, described)
+    assert isinstance(file, SweepFile)
+    if not file.jobs and not file.include:
+        raise UserError(f"{described} lists no jobs.")
+    entries = [{key: _listed(key, value) for key, value in entry.items()} for entry in file.jobs]
+    for other in file.include:
+        entries += read_sweep(other, extra, (*seen, name))
+    return entries
+
+
+def _listed(key: str, value: Any) -> list[str]:
+    """The words of one key of an entry."""
+    values = value if isinstance(value, tuple) else (value,)
+    return [f"{key}={_word(one)}" for one in values]
+
+
+def _word(value: Value) -> str:
+    """A value of a YAML file as it stands on a command line."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(value)

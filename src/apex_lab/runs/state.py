@@ -1,0 +1,137 @@
+"""What a run is doing, read from its folder by other processes: `status`, sweeps, tables. Imports no PyTorch.
+
+A run is alive while its process touches the lock file of its folder every `BEAT` seconds; one that was not touched for
+`LOST` seconds, or whose process is gone from this machine, is lost: the same command resumes it.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import read_json
+
+RECORD = "run.json"
+LOCK = ".lock"
+
+BEAT = 20.0
+LOST = 120.0
+
+State = Literal["waiting", "running", "lost", "paused", "interrupted", "failed", "finished", "damaged"]
+
+
+@dataclass(frozen=True)
+class RunState:
+    """A run as it stands.
+
+    Attributes:
+        folder: of the run; need not exist.
+        state: waiting (never started), running, lost (its process died without a word), paused (by
+            trainer.max_minutes), interrupted (by a signal), failed (by itself; diverged included), finished, damaged
+            (its record cannot be read).
+        reason: why it ended early, in a sentence.
+        record: content of run.json; empty where there is none.
+    """
+
+    folder: Path
+    state: State
+    reason: str | None
+    record: dict[str, Any]
+
+    @property
+    def steps(self) -> int:
+        """Weight updates done."""
+        value = self.record.get("steps", 0)
+        return value if isinstance(value, int) else 0
+
+    @property
+    def seconds(self) -> float:
+        """Of training, over all restarts."""
+        value = self.record.get("seconds", 0.0)
+        return float(value) if isinstance(value, int | float) else 0.0
+
+    @property
+    def owner(self) -> str:
+        """The process that works in it or did last."""
+        return f"process {self.record.get('pid')} on {self.record.get('host')}"
+
+
+def read_state(folder: Path) -> RunState:
+    """The state of a run folder; damage becomes a state, never an exception."""
+    file = folder / RECORD
+    if not file.is_file():
+        return RunState(folder, "waiting", None, {})
+    try:
+        record = read_json(file)
+    except UserError as error:
+        return RunState(folder, "damaged", str(error), {})
+    if not isinstance(record, dict):
+        return RunState(folder, "damaged", f"{file} holds no record of a run.", {})
+    state, reason = _state(folder, record)
+    return RunState(folder, state, reason, record)
+
+
+def _state(folder: Path, record: dict[str, Any]) -> tuple[State, str | None]:
+    status, outcome, reason = record.get("status"), record.get("outcome"), record.get("reason")
+    reason = reason if isinstance(reason, str) else None
+    if status == "running":
+        return ("running", None) if _alive(folder, record) else ("lost", "its process died without a word")
+    if status == "finished":
+        if (folder / "metrics.json").is_file():
+            return "finished", None
+        return "interrupted", "its metrics.json is gone"
+    if status == "paused" or outcome == "paused":
+        return "paused", reason
+    if outcome == "interrupted":
+        return "interrupted", reason
+    if status == "failed":
+        return "failed", reason
+    return "damaged", f"{folder / RECORD} has the status {status!r}."
+
+
+def _alive(folder: Path, record: dict[str, Any]) -> bool:
+    """Whether the process that works in a folder is there."""
+    pid = record.get("pid")
+    if record.get("host") == socket.gethostname() and isinstance(pid, int):
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return False
+        except OSError:
+            pass  # there, and another user's
+    try:
+        return time.time() - (folder / LOCK).stat().st_mtime < LOST
+    except OSError:
+        return False
+
+
+@contextmanager
+def beating(folder: Path) -> Iterator[None]:
+    """Inside, a thread shows that this process works in a run folder."""
+    stop = threading.Event()
+    _touch(folder)
+
+    def beat() -> None:
+        while not stop.wait(BEAT):
+            _touch(folder)
+
+    thread = threading.Thread(target=beat, daemon=True, name="heartbeat")
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _touch(folder: Path) -> None:
+    with suppress(OSError):  # a full or vanished disk is reported by whoever writes next
+        os.utime(folder / LOCK)

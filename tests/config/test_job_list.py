@@ -1,0 +1,111 @@
+"""The jobs of a command line: products, and lists in conf/sweep/."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from apex_lab.base.errors import UserError
+from apex_lab.config.composition import composed, composing
+from apex_lab.config.job_list import Words, expand
+
+
+@pytest.fixture
+def hydra() -> Iterator[None]:
+    with composing([]):
+        yield
+
+
+def listed(folder: Path, files: dict[str, str], *words: str) -> list[Words]:
+    """The jobs of a command that finds further sweep files in a folder."""
+    (folder / "sweep").mkdir()
+    for name, text in files.items():
+        (folder / "sweep" / f"{name}.yaml").write_text(text)
+    with composing(words):
+        return expand(words, [f"hydra.searchpath=[file://{folder}]"])
+
+
+@pytest.mark.usefixtures("hydra")
+def test_a_product_runs_its_last_key_fastest() -> None:
+    assert expand(["seed=0,1", "model.grid=range(4,9,4)", "scale=cpu"]) == [
+        ("seed=0", "model.grid=4", "scale=cpu"),
+        ("seed=0", "model.grid=8", "scale=cpu"),
+        ("seed=1", "model.grid=4", "scale=cpu"),
+        ("seed=1", "model.grid=8", "scale=cpu"),
+    ]
+
+
+@pytest.mark.usefixtures("hydra")
+def test_words_for_hydra_are_no_part_of_a_job() -> None:
+    words = ["hydra/launcher=basic", "seed=1", "++hydra.job.name=x", "hydra.mode=MULTIRUN", "~callbacks.progress"]
+    assert expand(words) == [("seed=1", "~callbacks.progress")]
+
+
+@pytest.mark.usefixtures("hydra")
+def test_an_interval_is_refused() -> None:
+    with pytest.raises(UserError, match=r"lr=interval\(1e-4,1e-2\) is an interval, .* search by apex_lab\.tune"):
+        expand(["optimizer.lr=interval(1e-4,1e-2)"])
+
+
+@pytest.mark.usefixtures("hydra")
+@pytest.mark.parametrize(
+    ("sweep", "number"), [("segmentation", 28), ("tracking", 20), ("ablations", 28), ("arrangement", 4), ("paper", 48)]
+)
+def test_the_paper_s_sweeps(sweep: str, number: int) -> None:
+    jobs = expand([f"+sweep={sweep}", "scale=smoke"])
+    assert len(jobs) == number  # paper: 6 models and 5 ablations x 4 seeds, 4 classical methods
+    assert all(job[-1] == "scale=smoke" for job in jobs)
+    assert len({(made.choices["model"], made.raw["seed"]) for made in composed("train", jobs[:4])}) == 4
+
+
+@pytest.mark.usefixtures("hydra")
+def test_the_command_s_words_replace_those_of_the_list() -> None:
+    assert expand(["+sweep=arrangement", "seed=1,2", "model=apex"]) == [
+        ("seed=1", "model=apex"),
+        ("seed=2", "model=apex"),
+    ]
+    assert len(expand(["+sweep=ablations", "+ablation=gaussian", "seed=0", "model=apex"])) == 1
+
+
+def test_a_sweep_is_a_union_of_products(tmp_path: Path) -> None:
+    files = {
+        "mine": "jobs: [{model: apex, +ablation: [gaussian, no_entropy], seed: 0}]\ninclude: [more]",
+        "more": "jobs: [{model: op3, seed: [0, 1], data.frames: null}, {model: apex, +ablation: gaussian, seed: 0}]",
+    }
+    assert listed(tmp_path, files, "+sweep=mine") == [
+        ("model=apex", "+ablation=gaussian", "seed=0"),
+        ("model=apex", "+ablation=no_entropy", "seed=0"),
+        ("model=op3", "seed=0", "data.frames=null"),
+        ("model=op3", "seed=1", "data.frames=null"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("include: [mine]", r"conf/sweep/mine\.yaml includes itself \(mine > mine\)"),
+        ("jobs: []", r"conf/sweep/mine\.yaml lists no jobs"),
+        ("jobs: {model: apex}", r"mine\.yaml\.jobs = "),
+        ("job: [{model: apex}]", r"Unknown key .*job"),
+        ("jobs: [{model: {_target_: os.system}}]", r"jobs\.0\.model"),
+    ],
+)
+def test_faulty_sweep_files(text: str, told: str, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=told):
+        listed(tmp_path, {"mine": text}, "+sweep=mine")
+
+
+def test_a_sweep_that_is_not_there() -> None:
+    with pytest.raises(UserError, match="sweep=ablation"), composing(["+sweep=ablation"]):
+        expand(["+sweep=ablation"])
+
+
+def test_seeds_share_a_composition() -> None:
+    words = [("model=apex", f"seed={seed}", "scale=smoke") for seed in (0, 5, 7)]
+    with composing([]):
+        made = list(composed("train", words))
+    assert [one.raw["seed"] for one in made] == [0, 5, 7]
+    assert [one.words for one in made] == words
+    assert {key for key in made[0].raw if made[0].raw[key] != made[2].raw[key]} == {"seed"}
