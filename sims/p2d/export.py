@@ -43,6 +43,9 @@ from sims.p2d.store import array_path, no_room
 from sims.p2d.trajectory import ARM_ID, FIRST_OBJECT_ID
 from sims.p2d.verify import check
 
+MARKER = ".p2d_export"
+"""A file in folders of unfinished exports; others are never removed."""
+
 FRAME_RATE = 10
 """Nominal: frames are spread evenly over a push, whose duration varies."""
 
@@ -88,18 +91,30 @@ def export(root: Path, out: Path, form: str, splits: Sequence[str], *, shown: bo
     if out.exists():
         raise SimError(f"{out} exists already: choose another folder")
     draft = out.with_name(f".{out.name}.unfinished")
+    if os.path.lexists(draft) and not _is_ours(draft):
+        raise SimError(f"{draft} is in the way, and no export made it: move it elsewhere")
     shutil.rmtree(draft, ignore_errors=True)
     total = sum(getattr(manifest.settings, split) for split in splits) * manifest.settings.frames
     try:
         draft.mkdir(parents=True)
+        (draft / MARKER).touch()
         with progress(f"{form} {out.name}", total, "frames", shown=shown) as advance:
             for split in splits:
                 WRITERS[form](draft, split, _videos(root, split, manifest, advance), manifest)
         os.replace(draft, out)
+        (out / MARKER).unlink()
     except OSError as error:
         raise no_room(error, error.filename or out) from error
     finally:
-        shutil.rmtree(draft, ignore_errors=True)
+        if _is_ours(draft):
+            shutil.rmtree(draft, ignore_errors=True)
+
+
+def _is_ours(draft: Path) -> bool:
+    """Whether a folder is of an export that was not finished, even one that was killed as it began."""
+    if draft.is_symlink() or not draft.is_dir():
+        return False
+    return (draft / MARKER).is_file() or not any(draft.iterdir())
 
 
 def _videos(root: Path, split: str, manifest: Manifest, advance: Callable[[int], None]) -> Iterator[Video]:

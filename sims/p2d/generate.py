@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import shutil
 import sys
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from filelock import FileLock, Timeout
@@ -32,7 +31,7 @@ from sims.p2d.pool import RECYCLE, Pool, Task
 from sims.p2d.progress import progress
 from sims.p2d.readme import README, readme
 from sims.p2d.settings import Settings
-from sims.p2d.store import SPLITS, Arrays, Key, allocate, check_room, keys, no_room
+from sims.p2d.store import FIELDS, SPLITS, Arrays, Key, allocate, array_path, check_room, keys, no_room
 from sims.p2d.verify import Damage, check, mismatches, note_verified, verify
 
 SIMULATOR = "sims.p2d.simulator"
@@ -217,7 +216,10 @@ def _allocate_or_leave_nothing(root: Path, settings: Settings) -> None:
         allocate(root, settings)
     except SimError:
         for split in SPLITS:  # empty arrays would only take up space on a full disk
-            shutil.rmtree(root / split, ignore_errors=True)
+            for name in FIELDS:
+                array_path(root, split, name).unlink(missing_ok=True)
+            with suppress(OSError):  # not there, or somebody put a file there
+                (root / split).rmdir()
         raise
 
 

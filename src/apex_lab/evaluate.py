@@ -7,6 +7,7 @@ python -m apex_lab.evaluate predictions=other.npz
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,11 +17,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import did_you_mean, sentence, shown, validate
+from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import schema as config
 from apex_lab.evaluation import OF_SCENES, Export, ScoringPart
-from apex_lab.evaluation.checkpoint import Request, evaluate_checkpoint, find, load
+from apex_lab.evaluation.checkpoint import Request, evaluate_checkpoint, load, refuse_without_posterior
+from apex_lab.evaluation.files import Bad, find, listed, look
 from apex_lab.evaluation.other_data import OtherData
 from apex_lab.evaluation.others import Predictions, check_output, output_of, score_others
 from apex_lab.metrics import KEYS
@@ -66,10 +68,11 @@ OF_PREDICTIONS = {"format": None, "truth": None, "partial": False, "resize": Non
 
 @dataclass(frozen=True)
 class Evaluation:
-    """One checked command: predictions of another program, or checkpoint files."""
+    """One checked command: predictions of another program, or checkpoint files; `bad` ones cannot be read."""
 
     asked: EvaluateConfig
     files: tuple[Path, ...] = ()
+    bad: Bad = field(default_factory=dict)
     data: OtherData = field(default_factory=OtherData)
     predictions: Predictions | None = None
 
@@ -85,7 +88,7 @@ def title(job: Evaluation) -> str:
 
 
 def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str]) -> Evaluation:
-    """Checks the command, and reads every checkpoint once.
+    """Checks the command, and looks into every checkpoint; one among several that cannot be read stops nothing.
 
     Raises:
         UserError: unknown key, impossible value, or something that cannot be evaluated; one sentence.
@@ -110,19 +113,20 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
         hint = did_you_mean(asked.pictures_by, ranks) or f": choose one of {', '.join(ranks)}"
         raise UserError(sentence(f"pictures_by = {shown(asked.pictures_by)} ranks no videos{hint}"))
     config.device(asked.accelerator)
-    files = find([asked.checkpoint] if isinstance(asked.checkpoint, str) else asked.checkpoint or [])
+    files, bad = find([asked.checkpoint] if isinstance(asked.checkpoint, str) else asked.checkpoint or [])
     if not files:
         raise UserError("checkpoint = [] names no file: give a .ckpt file or a run folder.")
     given = [word.lstrip("+").partition("=")[0] for word in overrides if word.lstrip("+").startswith("data.")]
     data = OtherData(asked.data, tuple(key.removeprefix("data.") for key in given))
-    jobs = {file: load(file, asked.paths, data, asked.trust)[1] for file in files}
-    if asked.scoring.masks == "posterior":
-        without = [str(file) for file, job in jobs.items() if not config.build_model(job.config).has_posterior]
-        if without:
-            raise UserError(
-                f"scoring.masks = posterior goes with mixture likelihoods alone: leave out {', '.join(without)}."
-            )
-    return Evaluation(asked, files=tuple(files), data=data)
+    good, unread = look(files, asked.paths, data, asked.trust)
+    if len(files) + len(bad) == 1 and good:
+        _, stored = load(files[0], asked.paths, data, asked.trust)
+        if asked.scoring.masks == "posterior":
+            refuse_without_posterior(config.build_model(stored.config), files[0])
+    bad |= unread
+    if not good:
+        raise UserError(next(iter(bad.values())) if len(bad) == 1 else listed(bad, len(bad)))
+    return Evaluation(asked, files=tuple(good), bad=bad, data=data)
 
 
 def evaluate(job: Evaluation) -> None:
@@ -135,19 +139,22 @@ def evaluate(job: Evaluation) -> None:
         score_others(job.predictions)
         return
     request = _request(job.asked, job.data)
-    if len(job.files) == 1:
+    count, failed = len(job.files) + len(job.bad), dict(job.bad)
+    if count == 1:
         evaluate_checkpoint(request, job.files[0], alone=True)
         return
-    failed = []
     for number, file in enumerate(job.files):
         console.say(f"checkpoint {number + 1} of {len(job.files)}: {file}")
         try:
             evaluate_checkpoint(request, file, alone=False)
         except UserError as error:
             console.error(str(error))
-            failed.append(str(file))
+            failed[file] = str(error)
+        except Exception as error:  # noqa: BLE001 - reported here and below; the others must still be evaluated
+            traceback.print_exc()
+            failed[file] = sentence(f"{type(error).__name__}: {one_line(error)}")
     if failed:
-        raise UserError(f"{len(failed)} of {len(job.files)} checkpoints were not evaluated: {', '.join(failed)}.")
+        raise UserError(listed(failed, count))
 
 
 def _refuse(asked: EvaluateConfig, others: Mapping[str, Any], kind: str) -> None:

@@ -6,11 +6,26 @@ import contextlib
 import errno
 import json
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
 
 from apex_lab.base.errors import UserError
+
+DRAFT = re.compile(r"\..+\.\d+\.apex_lab-part", re.ASCII)
+"""Names of files in the making. A kill leaves them; other hidden files are not ours and never removed."""
+
+
+def draft_of(path: Path) -> Path:
+    """Where this process writes what will stand at `path`."""
+    return path.with_name(f".{path.name}.{os.getpid()}.apex_lab-part")
+
+
+def drafts(folder: Path, of: str | None = None) -> list[Path]:
+    """The files in the making in a folder; those of one name, if it is given. None where there is no folder."""
+    found = [path for path in folder.glob(".*.apex_lab-part") if DRAFT.fullmatch(path.name) and path.is_file()]
+    return [path for path in found if of is None or re.fullmatch(rf"\.{re.escape(of)}\.\d+\.apex_lab-part", path.name)]
 
 
 @contextlib.contextmanager
@@ -24,7 +39,7 @@ def replacing(path: Path, keep: Path | None = None) -> Iterator[IO[bytes]]:
     Raises:
         UserError: the disk is full or the folder cannot be written; `path` is as it was before.
     """
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    part = draft_of(path)
     try:
         with open(part, "wb") as file:
             yield file

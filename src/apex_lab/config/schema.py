@@ -139,7 +139,11 @@ def refuse_missing(raw: Mapping[str, Any], prefix: str = "") -> None:
 
 
 def check_job(
-    raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str] = (), needs_recipe: bool = True
+    raw: dict[str, Any],
+    choices: Mapping[str, str],
+    overrides: Sequence[str] = (),
+    needs_recipe: bool = True,
+    to_train: bool = True,
 ) -> Job:
     """Checks everything that can be known before work starts; the first fault is reported in one sentence.
 
@@ -151,6 +155,8 @@ def check_job(
         choices: group -> word.
         overrides: the words on the command line.
         needs_recipe: refuse a model that learns without a recipe among the choices.
+        to_train: False for a configuration that only describes trained weights: nothing is built then, and what
+            training alone needs (recipe, optimiser, schedules, devices) is not compared.
 
     Raises:
         UserError: the sentence.
@@ -162,9 +168,11 @@ def check_job(
     config = validate(Config, raw, "", also_known=groups)
     assert isinstance(config, Config)
     refuse_missing(raw)
-    if needs_recipe:
+    if needs_recipe and to_train:
         _check_recipe(config, choices)
     _check_components(config)
+    if not to_train:
+        return Job(config, raw, dict(choices), tuple(overrides))
     _check_objective(config)
     _check_splits(config)
     _check_cuda_graph(config.trainer)

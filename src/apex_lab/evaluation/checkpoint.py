@@ -1,4 +1,4 @@
-"""Evaluates checkpoint files: which files are meant, where their results go, what has been done before."""
+"""Evaluates checkpoint files: where their results go, what has been done before."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import dataclasses
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +22,7 @@ from apex_lab.config import components
 from apex_lab.config import schema as config
 from apex_lab.data import VideoSource, whole_loader
 from apex_lab.evaluation.export import export_path
+from apex_lab.evaluation.files import here, of_another_version
 from apex_lab.evaluation.other_data import OtherData
 from apex_lab.evaluation.partial import Parts
 from apex_lab.evaluation.results import summary
@@ -56,24 +56,6 @@ class Request:
     trust: bool = False
 
 
-def find(patterns: Sequence[str]) -> list[Path]:
-    """The checkpoint files that are meant, each once, in the order of the patterns.
-
-    Args:
-        patterns: checkpoint files, run folders (their last checkpoint), folders that hold run folders, or patterns
-            with `*` for any of these.
-
-    Raises:
-        UserError: one of them means no checkpoint.
-    """
-    found: dict[Path, Path] = {}
-    for pattern in patterns:
-        for path in _matches(pattern):
-            for file in _files(path):
-                found.setdefault(file.resolve(), file)
-    return list(found.values())
-
-
 def load(
     file: Path, paths: config.PathsPart, data: OtherData | None = None, trusted: bool = False
 ) -> tuple[dict[str, Any], config.Job]:
@@ -89,20 +71,26 @@ def load(
         UserError: the file is no usable checkpoint, or the data's settings do not fit.
     """
     content = checkpoints.load(file, trusted)
-    stored = content["config"]
-    old, new = stored["paths"]["data"], paths.data
-    own = {key: new if value == old else value for key, value in stored["data"].items()}
+    stored = here(file, content["config"], paths)
     try:
-        job = config.check_job(
-            {**stored, "data": own, "paths": paths.model_dump()}, content["choices"], needs_recipe=False
-        )
+        job = config.check_job(stored, content["choices"], to_train=False)
     except UserError as error:
-        raise UserError(sentence(f"{file} was made by another version of apex_lab: {one_line(error)}")) from error
+        raise of_another_version(file, error) from error
     if data:
-        node = data.instead_of(own)
+        node = data.instead_of(stored["data"])
         components.check(node, "data")
         job = dataclasses.replace(job, config=job.config.model_copy(update={"data": node}))
     return content, job
+
+
+def refuse_without_posterior(model: SceneModel, file: Path) -> None:
+    """Looks for a posterior, which `scoring.masks=posterior` asks for.
+
+    Raises:
+        UserError: the model has none.
+    """
+    if not model.has_posterior:
+        raise UserError(f"scoring.masks = posterior goes with mixture likelihoods alone: leave out {file}.")
 
 
 def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
@@ -121,6 +109,8 @@ def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
         model = trained_model(content["inference"])
     except UserError as error:
         raise UserError(sentence(f"{file}: {one_line(error)}")) from error
+    if request.scoring.masks == "posterior":
+        refuse_without_posterior(model, file)
     with open(file, "rb") as opened:
         digest = hashlib.file_digest(opened, "sha256").hexdigest()
     folder = make_folder(_folder(request, file, content, job, model, digest, alone))
@@ -145,7 +135,9 @@ def _evaluate(
     folder: Path,
 ) -> None:
     device = config.device(request.accelerator)
-    source: VideoSource = components.build(job.config.data, "data")
+    source = components.build(job.config.data, "data")
+    if not isinstance(source, VideoSource):
+        raise UserError(f"data._target_ = {job.config.data['_target_']!r} is not an apex_lab.data.VideoSource.")
     source.prepare()
     source.open()
     key = _key(request, digest, source.fingerprint, device)
@@ -255,34 +247,5 @@ def _parts(request: Request, folder: Path, key: str) -> Parts:
     own = folder / f".{request.split}_{key[:16]}"
     for other in folder.glob(f".{request.split}_*"):
         if request.again or other != own:
-            shutil.rmtree(other)
+            Parts(other, request.save_interval).remove()
     return Parts(own, request.save_interval)
-
-
-def _matches(pattern: str) -> list[Path]:
-    path = Path(pattern)
-    if path.exists():
-        return [path]
-    if not any(mark in pattern for mark in "*?"):
-        raise UserError(f"checkpoint = {pattern} does not exist: give a .ckpt file or a run folder.")
-    start = Path(path.anchor) if path.is_absolute() else Path()
-    found = sorted(start.glob(str(path.relative_to(path.anchor))))
-    if not found:
-        raise UserError(f"checkpoint = {pattern} fits nothing: give .ckpt files or run folders.")
-    return found
-
-
-def _files(path: Path) -> list[Path]:
-    """The file itself; the last checkpoint of a run; those of all runs in a folder."""
-    if not path.is_dir():
-        return [path]
-    own = path / "checkpoints" / "last.ckpt"
-    if own.is_file():
-        return [own]
-    inside = sorted(file for file in path.rglob("last.ckpt") if file.parent.name == "checkpoints")
-    if not inside:
-        raise UserError(
-            f"checkpoint = {path} is a folder without checkpoints/last.ckpt, and no run folder is in it: "
-            "give a .ckpt file or a run folder."
-        )
-    return inside

@@ -6,9 +6,10 @@ computed from them again on resumption.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
-import shutil
+import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -19,7 +20,7 @@ import numpy as np
 from jaxtyping import Integer
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import make_folder, replacing
+from apex_lab.base.files import drafts, make_folder, replacing, write_text
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,16 @@ class Predicted:
     terms: dict[str, float] = field(default_factory=dict)
 
 
+MARKER = ".apex_lab_parts"
+"""A file in every folder of parts: folders without it are not ours and never touched."""
+
+MARKED = "Parts of an evaluation by apex_lab that was not finished; they are removed when it is.\n"
+
+
 class Parts:
     """Predictions in a folder, in the order of the split; a part is there wholly or not at all.
+
+    The folder carries `MARKER`. Only files that this class writes are ever removed.
 
     Args:
         folder: of this evaluation alone: its name holds the key of the evaluation.
@@ -62,6 +71,8 @@ class Parts:
         Raises:
             UserError: one is damaged.
         """
+        if not self._marked():
+            return
         for path in self._files():
             try:
                 yield from _read(path)
@@ -74,9 +85,12 @@ class Parts:
         """Adds a part.
 
         Raises:
-            UserError: the disk is full or the folder cannot be written.
+            UserError: the disk is full, the folder cannot be written, or it is somebody else's.
         """
-        make_folder(self.folder)
+        if not self._marked():
+            if any(make_folder(self.folder).iterdir()):
+                raise UserError(f"{self.folder} holds files that apex_lab did not write: move them elsewhere.")
+            write_text(self.folder / MARKER, MARKED)
         content: dict[str, Any] = {f"identities_{i}": predicted.identities for i, predicted in enumerate(predictions)}
         about = [
             {
@@ -95,12 +109,23 @@ class Parts:
             file.write(buffer.getvalue())
 
     def remove(self) -> None:
-        """Removes all parts, because the evaluation is over or starts again."""
-        if self.folder.exists():
-            shutil.rmtree(self.folder)
+        """Removes all parts, because the evaluation is over or starts again; a folder that is not ours stays."""
+        if not self._marked():
+            return
+        for path in [*self._files(), *drafts(self.folder)]:
+            path.unlink()
+        (self.folder / MARKER).unlink()
+        with contextlib.suppress(OSError):  # somebody put a file there
+            self.folder.rmdir()
+
+    def _marked(self) -> bool:
+        return not self.folder.is_symlink() and (self.folder / MARKER).is_file()
 
     def _files(self) -> list[Path]:
-        return sorted(self.folder.glob("*.npz"))
+        return sorted(path for path in self.folder.glob("*.npz") if _PART.fullmatch(path.name))
+
+
+_PART = re.compile(r"\d{6}\.npz", re.ASCII)
 
 
 def _read(path: Path) -> Iterator[Predicted]:

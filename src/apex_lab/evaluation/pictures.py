@@ -11,6 +11,7 @@ from torch.utils.data import default_collate
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder
+from apex_lab.base.signed import is_signed
 from apex_lab.data.video_set import VideoSet
 from apex_lab.inference.predictor import Predictor
 from apex_lab.metrics import KEYS
@@ -74,7 +75,8 @@ def draw(
 ) -> list[Path]:
     """Asks the model for the chosen videos once more and draws them; the pictures' paths, the film strip first.
 
-    Pictures of an earlier evaluation in the folder are replaced. A table of curves without a row is left out.
+    Pictures of an earlier evaluation in the folder are replaced, other people's stay. A table of curves without a row
+    is left out.
 
     Args:
         folder: where to.
@@ -94,5 +96,6 @@ def draw(
         caption = f"{title} {name}" if math.isnan(value) else f"{title} {name} ({key} {value:.2f})"
         items.append(Item(caption, batch["video"], scene, 0, batch.get("segmentation")))
     for old in make_folder(folder).glob("components_*.png"):
-        old.unlink()
+        if is_signed(old):
+            old.unlink()
     return render_all(folder, items, curves if curves is not None and has_rows(curves) else None)

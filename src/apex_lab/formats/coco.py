@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import draft_of
 from apex_lab.formats.rle import UNPAINTED, encode, paint
 from apex_lab.formats.video import PredictedVideo, labels_of, with_rest
 from apex_lab.metrics.contingency import BACKGROUND
@@ -85,7 +86,7 @@ class CocoWriter:
         if kind is not None:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        draft = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        draft = draft_of(self.path)
         page = {
             "info": {"description": "ground truth, written by apex_lab"},
             "licenses": [],

@@ -9,7 +9,7 @@ Palette and grey images are read, of 1 to 16 bits. The number in a file's name i
 
 from __future__ import annotations
 
-import shutil
+import os
 from pathlib import Path
 from types import TracebackType
 
@@ -18,6 +18,8 @@ from jaxtyping import Int64, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import draft_of
+from apex_lab.base.signed import is_signed, signature
 from apex_lab.formats.frames import numbered
 from apex_lab.formats.video import PredictedVideo, labels_of
 from apex_lab.metrics.order import natural_key
@@ -30,7 +32,7 @@ LABEL_MODES = ("P", "L", "1", "I", "I;16", "I;16B", "I;16L")
 
 
 class DavisWriter:
-    """Writes videos one at a time, each as a sub-folder of `path`; a folder of the same name is replaced.
+    """Writes videos one at a time, each as a sub-folder of `path`; frames that it wrote there before are replaced.
 
     Args:
         path: the folder.
@@ -49,16 +51,18 @@ class DavisWriter:
             UserError: more identities than a palette can tell apart, or a name that is no folder name.
         """
         folder = self.path / plain_name(video.name)
-        draft = self.path / f".{video.name}"
-        shutil.rmtree(draft, ignore_errors=True)
-        draft.mkdir()
-        for t, frame in enumerate(self._indices(video)):
+        indices = self._indices(video)
+        folder.mkdir(exist_ok=True)
+        names = [f"{t:05d}.png" for t in range(len(indices))]
+        for name, frame in zip(names, indices, strict=True):
             image = Image.fromarray(frame, mode="P")
             image.putpalette(palette().tobytes())
-            image.save(draft / f"{t:05d}.png")
-        if folder.exists():
-            shutil.rmtree(folder)
-        draft.rename(folder)
+            draft = draft_of(folder / name)
+            image.save(draft, format="PNG", pnginfo=signature())
+            os.replace(draft, folder / name)
+        for old in folder.glob("*.png"):
+            if old.name not in names and is_signed(old):
+                old.unlink()  # a frame of a longer video that was written here before
 
     def _indices(self, video: PredictedVideo) -> UInt8[np.ndarray, "T H W"]:
         if self.truth:

@@ -27,6 +27,7 @@ from types import TracebackType
 import numpy as np
 from jaxtyping import Float64, Integer
 
+from apex_lab.base.files import draft_of
 from apex_lab.formats.davis import plain_name
 from apex_lab.formats.rle import encode
 from apex_lab.formats.video import PredictedVideo, labels_of
@@ -130,6 +131,6 @@ def _visibility(objects: ObjectMetadata | None, frames: int) -> dict[int, Float6
 
 
 def _write(file: Path, lines: list[str]) -> None:
-    draft = file.with_name(f".{file.name}.{os.getpid()}")
+    draft = draft_of(file)
     draft.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
     os.replace(draft, file)

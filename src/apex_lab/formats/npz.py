@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import draft_of
 from apex_lab.formats.video import PredictedVideo, hard_segmentation, resized
 from apex_lab.scene import ABSENT
 
@@ -171,7 +172,7 @@ class NpzWriter:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._draft = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        self._draft = draft_of(self.path)
         self._archive = zipfile.ZipFile(self._draft, "w", zipfile.ZIP_DEFLATED)
 
     def add(self, video: PredictedVideo) -> None:

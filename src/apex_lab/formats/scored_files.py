@@ -16,6 +16,7 @@ from jaxtyping import Int64, Integer
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import draft_of
 from apex_lab.formats.coco import CocoTruth, Places, read_results, videos_with_results
 from apex_lab.formats.davis import frame_files, read_davis, video_names
 from apex_lab.formats.frames import check_pairs
@@ -131,7 +132,7 @@ def write_result(result: dict[str, Any], path: str | Path) -> None:
     """Writes a result as JSON, at once; tables as lists of rows, undefined values as null."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft = draft_of(path)
     draft.write_text(json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     os.replace(draft, path)
 

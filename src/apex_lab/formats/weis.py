@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import draft_of
 from apex_lab.formats.rle import UNPAINTED, paint, runs
 from apex_lab.formats.video import PredictedVideo, labels_of, with_rest
 from apex_lab.metrics.contingency import BACKGROUND
@@ -47,7 +48,7 @@ class WeisWriter:
     def __init__(self, path: str | Path, truth: bool = False, ignore_label: int | None = None) -> None:
         self.path, self.truth, self.ignore_label = Path(path), truth, ignore_label
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._draft = self.path.with_name(f".{self.path.name}.{os.getpid()}")
+        self._draft = draft_of(self.path)
         self._file = open(self._draft, "w", encoding="utf-8")  # noqa: SIM115 (closed in __exit__)
         self._separator, self._offset = "[", 0
 

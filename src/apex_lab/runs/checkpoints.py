@@ -14,7 +14,6 @@ A checkpoint is a dictionary of plain values and tensors, readable with `torch.l
 
 from __future__ import annotations
 
-import pickle
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -24,6 +23,7 @@ import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import replacing, unwritable
+from apex_lab.base.validation import one_line
 from apex_lab.config import components, trust
 from apex_lab.config.schema import Config, build_schedules
 from apex_lab.config.upgrades import FORMAT, upgraded
@@ -90,19 +90,49 @@ def load(path: Path, trusted: bool = False, known: Iterable[str] = ()) -> dict[s
     Raises:
         UserError: missing, damaged, no checkpoint of ours, or one that names classes that are not allowed.
     """
+    content = _upgraded(_read(path, trusted, known, whole=True))
+    weights = content["inference"]["weights"]
+    sick = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
+    if sick:
+        raise UserError(f"{path} holds weights that are not finite ({sick[0]}): its run diverged; use an earlier one.")
+    return content
+
+
+def glance(path: Path, trusted: bool = False) -> dict[str, Any]:
+    """What a checkpoint says about itself; its weights are neither read nor checked, so this takes milliseconds.
+
+    Args:
+        path: the file.
+        trusted: as of `load`.
+
+    Returns:
+        `step`, `config` (of today's format) and `choices`.
+
+    Raises:
+        UserError: as `load`, as far as it shows without the weights.
+    """
+    content = _read(path, trusted, (), whole=False)
+    return {key: content[key] for key in ("step", "config", "choices")}
+
+
+def _read(path: Path, trusted: bool, known: Iterable[str], whole: bool) -> dict[str, Any]:
+    """The content of a checkpoint of any format, with its configuration in today's; tensors mapped unless `whole`."""
     if not path.is_file():
         raise UserError(f"There is no checkpoint at {path}.")
-    if not zipfile.is_zipfile(path):
-        raise UserError(
-            f"{path} is no checkpoint, or its end is missing: give a .ckpt file of a run, or the run's folder."
-        )
     try:
-        with zipfile.ZipFile(path) as archive:
-            broken = archive.testzip()
-        if broken is not None:
-            raise UserError(f"{path} is damaged (checksum of {broken}): use another checkpoint.")
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, KeyError, ValueError, pickle.UnpicklingError, zipfile.BadZipFile) as error:
+        if not zipfile.is_zipfile(path):
+            raise UserError(
+                f"{path} is no checkpoint, or its end is missing: give a .ckpt file of a run, or the run's folder."
+            )
+        if whole:
+            with zipfile.ZipFile(path) as archive:
+                broken = archive.testzip()
+            if broken is not None:
+                raise UserError(f"{path} is damaged (checksum of {broken}): use another checkpoint.")
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=not whole)
+    except UserError:
+        raise
+    except Exception as error:  # what is raised for damaged bytes has no common class
         raise UserError(f"{path} is damaged or no checkpoint ({type(error).__name__}): use another one.") from error
     if not isinstance(content, dict) or "format" not in content or "weights" not in {**content, **_inside(content)}:
         raise UserError(f"{path} is no apex_lab checkpoint: give a .ckpt file of a run, or the run's folder.")
@@ -113,20 +143,37 @@ def load(path: Path, trusted: bool = False, known: Iterable[str] = ()) -> dict[s
         )
     if set(content) != _KEYS[content["format"]]:
         raise UserError(f"{path} is no apex_lab checkpoint: give a .ckpt file of a run, or the run's folder.")
-    config = upgraded(content["config"], content["format"])
+    missing = _missing(content)
+    if missing:
+        raise UserError(f"{path} is no apex_lab checkpoint (its {missing} is none): use another one.")
+    try:
+        config = upgraded(content["config"], content["format"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{path} holds no whole configuration ({one_line(error)}): use another one.") from error
     if not trusted:
         trust.check({"config": config, "inference": {"model": _inside(content).get("model")}}, str(path), known)
-    content = _upgraded({**content, "config": config})
-    weights = content["inference"]["weights"]
-    sick = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
-    if sick:
-        raise UserError(f"{path} holds weights that are not finite ({sick[0]}): its run diverged; use an earlier one.")
-    return content
+    return {**content, "config": config}
 
 
 def _inside(content: dict[str, Any]) -> dict[str, Any]:
     inside = content.get("inference")
     return inside if isinstance(inside, dict) else {}
+
+
+_OF_INFERENCE = {"model": dict, "weights": dict, "schedule": dict, "precision": object, "seed": int}
+
+
+def _missing(content: dict[str, Any]) -> str | None:
+    """The first entry that is not what it must be."""
+    kinds: dict[str, type] = {"config": dict, "choices": dict, "step": int}
+    for name, kind in kinds.items():
+        if not isinstance(content[name], kind):
+            return name
+    inside = _inside(content) if content["format"] > 1 else {"weights": content["weights"]}
+    for name, wanted in _OF_INFERENCE.items() if content["format"] > 1 else ():
+        if not isinstance(inside.get(name), wanted):
+            return f"inference.{name}"
+    return None if all(isinstance(value, torch.Tensor) for value in inside["weights"].values()) else "weights"
 
 
 def _upgraded(content: dict[str, Any]) -> dict[str, Any]:

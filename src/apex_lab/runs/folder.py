@@ -25,7 +25,7 @@ import yaml
 from filelock import FileLock, Timeout
 
 from apex_lab.base.errors import Busy, UserError
-from apex_lab.base.files import make_folder, read_json, write_json, write_text
+from apex_lab.base.files import drafts, make_folder, read_json, write_json, write_text
 from apex_lab.config.schema import Job
 from apex_lab.config.upgrades import FORMAT, fingerprint, upgraded
 from apex_lab.runs import provenance
@@ -146,8 +146,9 @@ class Run:
     def start(self, command: str, device: torch.device) -> None:
         """Records that work begins or resumes, and with what."""
         make_folder(self.folder / "checkpoints")
-        for part in self.folder.rglob(".*.part"):
-            part.unlink()  # left by a kill in the middle of writing
+        for place in (self.folder, *self._places()):
+            for part in drafts(place):
+                part.unlink()  # left by a kill in the middle of writing
         commit, dirty = provenance.commit()
         now, choices, config = _now(), self.job.choices, self.job.config
         history = [*self.record.get("history", []), {"started": now, "command": command, "commit": commit}]
@@ -178,6 +179,11 @@ class Run:
         }
         write_text(self.folder / "config.yaml", yaml.safe_dump(self.job.raw, sort_keys=False, allow_unicode=True))
         self.save()
+
+    def _places(self) -> list[Path]:
+        """Folders that training writes into; evaluations in folders of their own have locks of their own."""
+        view = [path for path in self.view_folder.rglob("*") if path.is_dir()]
+        return [self.folder / "checkpoints", self.view_folder, *view]
 
     def update(self, **entries: Any) -> None:
         """Changes entries of the record."""

@@ -16,6 +16,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.validation import sentence, shown, validate
 from apex_lab.metrics import KEYS
+from apex_lab.metrics.order import natural_key
 
 MIN_SHARE, MAX_SHARE = 0.001, 0.999
 """A seed has failed whose objects are given less or more of the validation pixels (metrics.md section 3)."""
@@ -115,7 +116,7 @@ def run_words(model: str | None, ablation: str | None, data: str | None, scale: 
 
 
 def collect(outputs: Path) -> list[SeedRun]:
-    """Every run in a folder, in the order of their names; none where the folder does not exist.
+    """Every run in a folder, in the natural order of their names; none where the folder does not exist.
 
     Raises:
         UserError: the folder cannot be listed.
@@ -123,13 +124,14 @@ def collect(outputs: Path) -> list[SeedRun]:
     if not outputs.exists():
         return []
     try:
-        groups = sorted(path for path in outputs.iterdir() if path.is_dir())
+        groups = [path for path in outputs.iterdir() if path.is_dir()]
         folders = [(int(p.name[5:]), p) for g in groups for p in g.glob("seed_*") if _is_seed(p)]
     except OSError as error:
         raise UserError(
             f"paths.outputs = {outputs} cannot be read ({error.strerror}): give a folder of runs."
         ) from error
-    return [read_run(path, seed) for seed, path in sorted(folders, key=lambda pair: (pair[1].parent, pair[0]))]
+    ordered = sorted(folders, key=lambda pair: (natural_key(pair[1].parent.name), pair[0]))
+    return [read_run(path, seed) for seed, path in ordered]
 
 
 def _is_seed(path: Path) -> bool:

@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from apex_lab.base.files import make_folder, replacing
+from apex_lab.base.signed import signature
 from apex_lab.view.colors import Color
 
 PAPER: Color = (255, 255, 255)
@@ -67,7 +68,7 @@ def save_png(path: Path, page: Image.Image) -> None:
         UserError: the file cannot be written.
     """
     with picture_file(path) as file:
-        page.save(file, format="PNG", optimize=True)
+        page.save(file, format="PNG", optimize=True, pnginfo=signature())
 
 
 @contextlib.contextmanager
