@@ -66,7 +66,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no inference": (lambda file: change(file, lambda c: c["inference"].pop("model")), "(its inference.model is none)"),
     "weights are text": (
         lambda file: change(file, lambda c: c["inference"]["weights"].update(base="text")),
-        "(its weights is none)",
+        "(its weight base is no tensor)",
     ),
     "other weights": (
         lambda file: change(file, lambda c: c["inference"]["weights"].pop("base")),

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import os
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -142,3 +144,38 @@ def test_torch_s_own_error_on_a_full_disk_is_told(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(builtins, "open", onto_full)
     with pytest.raises(UserError, match="No space left for"):
         checkpoints.save(tmp_path / "last.ckpt", content())
+
+
+def test_a_glance_reads_the_plain_values_alone_and_calls_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "last.ckpt"
+    checkpoints.save(path, content())
+    assert checkpoints.glance(path) == {key: content()[key] for key in ("step", "config", "choices")}
+
+    proof = tmp_path / "proof"
+
+    class Hostile:
+        def __reduce__(self) -> tuple[Any, ...]:
+            return os.system, (f"touch {proof}",)
+
+    torch.save({"format": FORMAT, **content(), "choices": {"model": Hostile()}}, path)
+    checkpoints.glance(path)
+    assert not proof.exists()
+    with pytest.raises(UserError, match=r"is damaged or no checkpoint \(UnpicklingError\)"):
+        checkpoints.load(path)
+    assert not proof.exists()
+
+
+def test_a_glance_of_a_damaged_file_is_a_sentence(tmp_path: Path) -> None:
+    path = tmp_path / "last.ckpt"
+    checkpoints.save(path, content())
+    whole = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        (name,) = [name for name in archive.namelist() if name.endswith("data.pkl")]
+        inside = archive.read(name)
+    start = whole.index(inside)
+    for place in range(0, len(inside), 7):
+        damaged = bytearray(whole)
+        damaged[start + place] ^= 255
+        path.write_bytes(damaged)
+        with pytest.raises(UserError, match="is damaged or no checkpoint"):
+            checkpoints.glance(path)

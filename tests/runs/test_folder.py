@@ -85,7 +85,12 @@ def test_a_record_goes_from_running_to_its_end(job: Job) -> None:
 def test_what_a_kill_left_half_written_is_removed(job: Job) -> None:
     with Run(job) as run:
         run.start("", torch.device("cpu"))
-        half = run.folder / "checkpoints" / ".last.ckpt.123.part"
-        half.write_text("half")
+        folders = [run.folder, run.folder / "checkpoints", run.folder / "view" / "test", run.folder / "evaluate" / "x"]
+        ours = [folder / ".last.ckpt.123.apex_lab.part" for folder in folders]
+        theirs = [folder / name for folder in folders for name in (".mine.part", ".last.ckpt.123.part", "a.part")]
+        for file in ours + theirs:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text("half")
         run.start("", torch.device("cpu"))
-        assert not half.exists()
+        assert [file.exists() for file in ours] == [False, False, False, True]  # an evaluation has a lock of its own
+        assert all(file.exists() for file in theirs)

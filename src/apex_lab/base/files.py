@@ -13,19 +13,19 @@ from typing import IO, Any
 
 from apex_lab.base.errors import UserError
 
-DRAFT = re.compile(r"\..+\.\d+\.apex_lab-part", re.ASCII)
+DRAFT = re.compile(r"\..+\.\d+\.apex_lab\.part", re.ASCII)
 """Names of files in the making. A kill leaves them; other hidden files are not ours and never removed."""
 
 
 def draft_of(path: Path) -> Path:
     """Where this process writes what will stand at `path`."""
-    return path.with_name(f".{path.name}.{os.getpid()}.apex_lab-part")
+    return path.with_name(f".{path.name}.{os.getpid()}.apex_lab.part")
 
 
 def drafts(folder: Path, of: str | None = None) -> list[Path]:
     """The files in the making in a folder; those of one name, if it is given. None where there is no folder."""
-    found = [path for path in folder.glob(".*.apex_lab-part") if DRAFT.fullmatch(path.name) and path.is_file()]
-    return [path for path in found if of is None or re.fullmatch(rf"\.{re.escape(of)}\.\d+\.apex_lab-part", path.name)]
+    found = [path for path in folder.glob(".*.apex_lab.part") if DRAFT.fullmatch(path.name) and path.is_file()]
+    return [path for path in found if of is None or re.fullmatch(rf"\.{re.escape(of)}\.\d+\.apex_lab\.part", path.name)]
 
 
 @contextlib.contextmanager

@@ -27,6 +27,7 @@ from apex_lab.base.validation import one_line
 from apex_lab.config import components, trust
 from apex_lab.config.schema import Config, build_schedules
 from apex_lab.config.upgrades import FORMAT, upgraded
+from apex_lab.runs.outlines import outline
 from apex_lab.scene import SceneModel
 
 _KEYS = {
@@ -92,6 +93,9 @@ def load(path: Path, trusted: bool = False, known: Iterable[str] = ()) -> dict[s
     """
     content = _upgraded(_read(path, trusted, known, whole=True))
     weights = content["inference"]["weights"]
+    strange = [name for name, weight in weights.items() if not isinstance(weight, torch.Tensor)]
+    if strange:
+        raise UserError(f"{path} is no apex_lab checkpoint (its weight {strange[0]} is no tensor): use another one.")
     sick = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
     if sick:
         raise UserError(f"{path} holds weights that are not finite ({sick[0]}): its run diverged; use an earlier one.")
@@ -116,7 +120,7 @@ def glance(path: Path, trusted: bool = False) -> dict[str, Any]:
 
 
 def _read(path: Path, trusted: bool, known: Iterable[str], whole: bool) -> dict[str, Any]:
-    """The content of a checkpoint of any format, with its configuration in today's; tensors mapped unless `whole`."""
+    """The content of a checkpoint of any format, with its configuration in today's; without tensors unless `whole`."""
     if not path.is_file():
         raise UserError(f"There is no checkpoint at {path}.")
     try:
@@ -129,7 +133,7 @@ def _read(path: Path, trusted: bool, known: Iterable[str], whole: bool) -> dict[
                 broken = archive.testzip()
             if broken is not None:
                 raise UserError(f"{path} is damaged (checksum of {broken}): use another checkpoint.")
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=not whole)
+        content = torch.load(path, map_location="cpu", weights_only=True) if whole else outline(path)
     except UserError:
         raise
     except Exception as error:  # what is raised for damaged bytes has no common class
@@ -171,9 +175,9 @@ def _missing(content: dict[str, Any]) -> str | None:
             return name
     inside = _inside(content) if content["format"] > 1 else {"weights": content["weights"]}
     for name, wanted in _OF_INFERENCE.items() if content["format"] > 1 else ():
-        if not isinstance(inside.get(name), wanted):
+        if name not in inside or not isinstance(inside[name], wanted):
             return f"inference.{name}"
-    return None if all(isinstance(value, torch.Tensor) for value in inside["weights"].values()) else "weights"
+    return None if isinstance(inside["weights"], dict) else "weights"
 
 
 def _upgraded(content: dict[str, Any]) -> dict[str, Any]:
