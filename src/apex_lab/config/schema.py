@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
-from apex_lab.config import components
+from apex_lab.config import ablations, components
 from apex_lab.config.components import is_node
 from apex_lab.config.composition import Composed, conf_dir
 from apex_lab.data.source import VideoSource
@@ -168,6 +168,8 @@ def check_job(
     config = validate(Config, raw, "", also_known=groups)
     assert isinstance(config, Config)
     refuse_missing(raw)
+    if to_train:
+        ablations.check(raw, choices, conf_dir())
     if needs_recipe and to_train:
         _check_recipe(config, choices)
     _check_components(config)
