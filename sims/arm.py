@@ -96,7 +96,7 @@ def arm_model() -> ArmModel:
         "sources": {str(path.relative_to(source)): file_hash(path) for path in sources},
     }
     folder = made_once("panda", recipe, lambda target: _make(source, target))
-    hulls = np.load(folder / "hulls.npz")
+    hulls = np.load(folder / "hulls.npz", allow_pickle=False)
     files = source / "panda.urdf", folder / "visual.urdf", folder / "physics.urdf"
     return ArmModel(*files, {name: hulls[name] for name in hulls.files})
 

@@ -165,7 +165,7 @@ def _resting(points: np.ndarray, roll: float, pitch: float) -> np.ndarray:
 
 
 def _read(folder: Path, name: str, entry: Entry) -> ObjectModel:
-    body = np.load(folder / "body.npz")
+    body = np.load(folder / "body.npz", allow_pickle=False)
     mass = entry.mass_kg
     if mass is None:
         mass = float(np.clip(DENSITY_KG_M3 * body["volume"], *MASS_KG))

@@ -46,7 +46,7 @@ def write_card(root: Path, out: Path) -> Path:
 
 def _arrays(root: Path, split: str) -> tuple[np.ndarray, ...]:
     names = ("rgb", "segmentation", "classes", "visible_px", "amodal_px", "arm_contact")
-    return tuple(np.load(array_path(root, split, name), mmap_mode="r") for name in names)
+    return tuple(np.load(array_path(root, split, name), mmap_mode="r", allow_pickle=False) for name in names)
 
 
 def _crops(root: Path, manifest: Manifest, split: str) -> list[list[np.ndarray]]:

@@ -121,7 +121,7 @@ def _videos(root: Path, split: str, manifest: Manifest, advance: Callable[[int],
     count = getattr(manifest.settings, split)
     names = ("rgb", "segmentation", "classes", "visible_px", "amodal_px")
     mode = "r" if count else None
-    arrays = [np.load(array_path(root, split, name), mmap_mode=mode) for name in names]  # type: ignore[arg-type]
+    arrays = [np.load(array_path(root, split, name), mmap_mode=mode, allow_pickle=False) for name in names]  # type: ignore[arg-type]
     for index in range(count):
         rgb, segmentation, classes, visible, amodal = (np.asarray(array[index]) for array in arrays)
         used = {FIRST_OBJECT_ID + slot: manifest.classes[c] for slot, c in enumerate(classes) if c >= 0}

@@ -112,12 +112,12 @@ _NEEDED = ("classes", "visible_px", "amodal_px", "poses", "arm_contact", "object
 
 
 def _load(root: Path, split: str, name: str) -> np.ndarray:
-    return np.load(array_path(root, split, name))
+    return np.load(array_path(root, split, name), allow_pickle=False)
 
 
 def _map(root: Path, split: str) -> np.ndarray:
     path = array_path(root, split, "segmentation")
-    array = np.load(path, mmap_mode="r") if path.stat().st_size > 128 else np.load(path)
+    array = np.load(path, mmap_mode="r" if path.stat().st_size > 128 else None, allow_pickle=False)
     return np.asarray(array)
 
 

@@ -58,7 +58,7 @@ def train(job: Job) -> None:
     """
     outside = ranks.given()
     if outside is not None and outside.rank > 0:
-        worker.train_along(ranks.wait_for(ranks.job_file(run_folder(job))), outside)
+        worker.train_along(ranks.wait_for(ranks.job_file(run_folder(job))), outside, _named(job))
         return
     with Run(job) as run:
         if run.finished:
@@ -76,6 +76,11 @@ def train(job: Job) -> None:
                 raise
             run.finish()
             _show(run)
+
+
+def _named(job: Job) -> list[str]:
+    """The classes that the user's own command names; files in the run folder may name them too."""
+    return [str(name) for _, name in trust.targets(job.raw)]
 
 
 def _reason(error: BaseException) -> tuple[str, Outcome]:
@@ -183,7 +188,7 @@ def _show(run: Run) -> None:
 def _checkpoint(run: Run) -> dict[str, Any] | None:
     """What to resume from; a damaged last checkpoint is reported, and the one before it taken."""
     paths = [path for path in (run.last, checkpoints.previous(run.last)) if path.exists()]
-    known = [str(name) for _, name in trust.targets(run.job.raw)]  # the user's own configuration
+    known = _named(run.job)
     for path in paths:
         try:
             return checkpoints.load(path, known=known)

@@ -6,12 +6,13 @@ Seeds of one configuration differ in one number, so a list of jobs is composed o
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -21,6 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, sentence
+from apex_lab.config import trust
 
 CHOICES = ("model", "ablation", "data", "scale", "experiment", "tuned")
 """Groups that name a run; a run has one choice of each."""
@@ -145,9 +147,24 @@ def _template(name: str, words: Sequence[str]) -> tuple[DictConfig, dict[str, st
     """An unresolved configuration and its choices."""
     config = compose(name, overrides=list(words), return_hydra_config=True)
     choices = chosen(config.hydra.runtime)
+    _check_tuned(choices, config.hydra.runtime)
     own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
     OmegaConf.set_struct(own, False)
     return own, choices
+
+
+def _check_tuned(choices: Mapping[str, str], runtime: Any) -> None:
+    """Refuses a file of `+tuned=<name>` that does more than set values; such files are passed on.
+
+    Raises:
+        UserError: what it may not hold.
+    """
+    if "tuned" not in choices:
+        return
+    folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
+    for file in (folder / "tuned" / f"{choices['tuned']}.yaml" for folder in folders):
+        if file.is_file():
+            trust.only_values(yaml.safe_load(file.read_text(encoding="utf-8")) or {}, str(file))
 
 
 def not_there(error: Exception) -> str | None:

@@ -25,6 +25,7 @@ from pydantic import BaseModel, ConfigDict
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import validate
+from apex_lab.config import trust
 
 Words = tuple[str, ...]
 
@@ -107,6 +108,7 @@ def read_sweep(name: str, extra: Sequence[str] = (), seen: Words = ()) -> list[d
     if not file.jobs and not file.include:
         raise UserError(f"{described} lists no jobs.")
     entries = [{key: _listed(key, value) for key, value in entry.items()} for entry in file.jobs]
+    trust.only_words((word for entry in entries for words in entry.values() for word in words), described)
     for other in file.include:
         entries += read_sweep(other, extra, (*seen, name))
     return entries

@@ -129,7 +129,7 @@ class P2D(VideoSet):
         count = total if sample is None else min(sample, total)
         cache = self.root / f".median_{self.split}_{count}_{self.manifest.content[:8]}.npy"
         with suppress(OSError, ValueError, EOFError):  # not there, or cut off by a power cut: computed again
-            return torch.from_numpy(np.load(cache))
+            return torch.from_numpy(np.load(cache, allow_pickle=False))
         median = super().median(sample).numpy()
         draft = cache.with_name(f"{cache.name}.{os.getpid()}")
         with suppress(OSError):  # where nothing can be written, it is computed every time
@@ -147,7 +147,7 @@ class P2D(VideoSet):
         """The memory map of an array, opened at first use in each process."""
         if name not in self._arrays:
             mode = "r" if len(self) else None  # what is empty cannot be mapped
-            self._arrays[name] = np.load(array_path(self.root, self.split, name), mmap_mode=mode)  # type: ignore[arg-type]
+            self._arrays[name] = np.load(array_path(self.root, self.split, name), mmap_mode=mode, allow_pickle=False)  # type: ignore[arg-type]
         return self._arrays[name]
 
     def __getstate__(self) -> dict[str, Any]:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 
 from apex_lab.base import console
-from apex_lab.config import components
+from apex_lab.config import components, trust
 from apex_lab.config.schema import Config, build_model
 from apex_lab.training.fit import fit
 from apex_lab.training.ranks import JOB, Ranks, end_with_parent
@@ -24,9 +25,21 @@ def main() -> None:
     train_along(Path(os.environ[JOB]), Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])))
 
 
-def train_along(file: Path, ranks: Ranks) -> None:
-    """Trains as one of several ranks from what rank 0 has left in a file."""
+def train_along(file: Path, ranks: Ranks, known: Iterable[str] | None = None) -> None:
+    """Trains as one of several ranks from what rank 0 has left in a file.
+
+    Args:
+        file: the job.
+        ranks: which process this is.
+        known: names of classes that this process's own command names besides the project's; the file, which lies in a
+            run folder, may name no others. None for a file of the process that started this one.
+
+    Raises:
+        UserError: the file names another class.
+    """
     job = torch.load(file, map_location="cpu", weights_only=True)
+    if known is not None:
+        trust.check(job["config"], str(file), known)
     config = Config(**job["config"])
     model = build_model(config)
     model.load_state_dict(job["weights"])
