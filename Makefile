@@ -22,9 +22,10 @@ install: $(INSTALLED)
 $(BIN)/python:
 	$(BASE_PYTHON) -m venv $(VENV)
 
-$(INSTALLED): pyproject.toml | $(BIN)/python
+$(INSTALLED): pyproject.toml tests/no_deps.txt | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --no-deps --requirement tests/no_deps.txt
 	touch $@
 
 test: install

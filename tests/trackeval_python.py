@@ -1,7 +1,7 @@
 """Which Python has TrackEval: this one, or one of its own, since its requirements do not go with ours.
 
-TrackEval wants opencv-python, which takes the place of our opencv-python-headless. Either
-`pip install --no-deps trackeval && pip install tabulate scikit-image` here, or
+TrackEval wants opencv-python, which takes the place of our opencv-python-headless. `make install` installs it without its
+requirements (tests/no_deps.txt). Or make an environment of its own:
 `python -m venv ENV && ENV/bin/pip install trackeval scikit-image` and `APEX_LAB_TRACKEVAL_PYTHON=ENV/bin/python`.
 """
 
@@ -21,7 +21,7 @@ _HERE = sys.executable if importlib.util.find_spec("trackeval") and importlib.ut
 PYTHON = os.environ.get("APEX_LAB_TRACKEVAL_PYTHON", _HERE)
 
 needs_trackeval = pytest.mark.skipif(
-    PYTHON is None, reason="no TrackEval: pip install --no-deps trackeval && pip install tabulate scikit-image"
+    PYTHON is None, reason="no TrackEval: pip install --no-deps -r tests/no_deps.txt"
 )
 
 

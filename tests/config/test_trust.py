@@ -12,6 +12,7 @@ import torch
 import yaml
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import write_json
 from apex_lab.config import trust
 from apex_lab.runs.folder import group_name, run_folder
 from apex_lab.tables.found import collect
@@ -223,9 +224,8 @@ def test_the_config_yaml_of_a_run_folder_is_compared_and_never_built(
     proof = tmp_path / "proof"
     planted = Path("outputs") / f"{group_name(job).rpartition('_')[0]}_00000000" / "seed_0"
     planted.mkdir(parents=True)
-    (planted / "run.json").write_text(
-        '{"format": 1, "status": "finished", "model": "tiny", "data": "squares", "scale": "smoke", "seed": 0}'
-    )
+    words = {"model": "tiny", "data": "squares", "scale": "smoke"}
+    write_json(planted / "run.json", {"format": 1, "status": "finished", "seed": 0, **words})
     hostile = {**job.raw, "model": {"_target_": "os.system", "command": f"touch {proof}"}}
     for text in (yaml.safe_dump(hostile), f"model: !!python/object/apply:os.system ['touch {proof}']", "seed: 0"):
         (planted / "config.yaml").write_text(text)

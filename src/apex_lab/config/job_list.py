@@ -101,7 +101,7 @@ def read_sweep(name: str, extra: Sequence[str] = (), seen: Words = ()) -> list[d
     """
     if name in seen:
         raise UserError(f"conf/sweep/{seen[0]}.yaml includes itself ({' > '.join([*seen, name])}).")
-    node = OmegaConf.to_container(compose("train", overrides=[*extra, f"+sweep={name}"]).sweep, resolve=False)
+    node: Any = OmegaConf.to_container(compose("train", overrides=[*extra, f"+sweep={name}"]).sweep, resolve=False)
     described = f"conf/sweep/{name}.yaml"
     file = validate(SweepFile, node if isinstance(node, dict) else {"": node}, described)
     assert isinstance(file, SweepFile)

@@ -24,13 +24,18 @@ OWN = re.compile(r"apex_lab\.(models|data|training)(\.[a-z][a-z0-9_]*)*\.[A-Z]\w
 """Full names of the project's components: a class in one of three packages."""
 
 
-def check(config: Any, where: str, known: Iterable[str] = ()) -> None:
+IN_CHECKPOINTS = "write trust=true if you trust whoever made this file"
+IN_VALUES = "name it on the command line, or in a file of a group that chooses components"
+
+
+def check(config: Any, where: str, known: Iterable[str] = (), advice: str = IN_CHECKPOINTS) -> None:
     """Refuses a configuration that names anything but components of the project.
 
     Args:
         config: plain containers.
         where: the file, for the message.
         known: further names that are allowed, because the user's own configuration has them.
+        advice: what to do about another name.
 
     Raises:
         UserError: the first name that is refused.
@@ -39,8 +44,7 @@ def check(config: Any, where: str, known: Iterable[str] = ()) -> None:
     for key, name in targets(config):
         if not _is_own(name) and not (isinstance(name, str) and name in allowed):
             raise UserError(
-                f"{where} wants to build {shown(name)} ({key}), which is no component of apex_lab: "
-                "write trust=true if you trust whoever made this file."
+                f"{where} wants to build {shown(name)} ({key}), which is no component of apex_lab: {advice}."
             )
 
 
@@ -103,7 +107,7 @@ def only_values(node: Any, source: str, known: Iterable[str] = ()) -> None:
         )
         if not fine:
             raise UserError(
-                f"{source} may not have {shown(entry)} among its defaults: choices like /model: apex alone."
+                f"{source} may not have {shown(entry)} among its defaults, which choose alone: /model: apex."
             )
     _refuse_more_than_values({key: value for key, value in node.items() if key != "defaults"}, source, known)
 
@@ -120,24 +124,30 @@ def only_words(words: Iterable[str], source: str, known: Iterable[str] = ()) -> 
         UserError: the first that is refused.
         OverrideParseException: Hydra cannot read one.
     """
-    known = frozenset(known)
-    for override in OverridesParser.create().parse_overrides(list(words)):
+    known, words = frozenset(known), list(words)
+    for word in words:
+        _refuse_interpolation(word, source)
+    for override in OverridesParser.create().parse_overrides(words):
         line = str(override.input_line)
         key = re.sub(r"[/@].*", "", override.get_key_element().lstrip("+~"))
         if override.is_sweep_override() and "_target_" in line:
             raise UserError(f"{source} may not hold {shown(line)}: write the values as a list.")
         value = None if override.is_delete() or override.is_sweep_override() else override.value()
-        _refuse_more_than_values({key: value, "": line if "${" in line else None}, source, known)
+        _refuse_more_than_values({key: value}, source, known)
 
 
 def _refuse_more_than_values(node: Mapping[str, Any], source: str, known: Iterable[str]) -> None:
-    check(node, source, known)
+    check(node, source, known, IN_VALUES)
     for key, value in _leaves(node):
         if key.partition(".")[0] == "hydra":
             raise UserError(f"{source} may not set {key}, which is Hydra's own: give it on the command line.")
         for text in (key, value):
-            if isinstance(text, str) and "${" in text:
-                raise UserError(f"{source} may not hold {shown(text)}: write the value itself.")
+            _refuse_interpolation(text, source)
+
+
+def _refuse_interpolation(text: Any, source: str) -> None:
+    if isinstance(text, str) and "${" in text:
+        raise UserError(f"{source} may not hold {shown(text)}: write the value itself.")
 
 
 def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
