@@ -1,7 +1,7 @@
 """Which Python has TrackEval: this one, or one of its own, since its requirements do not go with ours.
 
-TrackEval wants opencv-python, which takes the place of our opencv-python-headless. `make install` installs it without its
-requirements (tests/no_deps.txt). Or make an environment of its own:
+TrackEval wants opencv-python, which takes the place of our opencv-python-headless. `make install` installs it without
+its requirements (tests/no_deps.txt). Or make an environment of its own:
 `python -m venv ENV && ENV/bin/pip install trackeval scikit-image` and `APEX_LAB_TRACKEVAL_PYTHON=ENV/bin/python`.
 """
 
