@@ -20,9 +20,7 @@ import pytest
 _HERE = sys.executable if importlib.util.find_spec("trackeval") and importlib.util.find_spec("skimage") else None
 PYTHON = os.environ.get("APEX_LAB_TRACKEVAL_PYTHON", _HERE)
 
-needs_trackeval = pytest.mark.skipif(
-    PYTHON is None, reason="no TrackEval: pip install --no-deps -r tests/no_deps.txt"
-)
+needs_trackeval = pytest.mark.skipif(PYTHON is None, reason="no TrackEval: pip install --no-deps -r tests/no_deps.txt")
 
 
 def ask_trackeval(script: Path, question: object) -> Any:
