@@ -22,8 +22,10 @@ from typing import Any
 
 import torch
 
+from apex_lab.base import interrupts
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import replacing
+from apex_lab.base.interrupts import Interrupted
 
 JOB = "APEX_LAB_JOB"
 """Environment variable of a process that rank 0 has started: the file with the job."""
@@ -93,6 +95,9 @@ def started(job: dict[str, Any], devices: int, nodes: int, folder: Path) -> Iter
             try:
                 yield Ranks(0, devices)
             except RuntimeError as error:
+                signum = interrupts.asked()
+                if signum is not None:  # it may have reached the others too
+                    raise Interrupted(signum) from error
                 raise _death(workers) or error from error
             for worker in workers:
                 worker.wait(timeout=60)
