@@ -37,6 +37,45 @@ def test_curves_of_a_resumed_run_lose_what_will_be_done_again(tmp_path: Path) ->
     assert lines(path) == ["step,train/loss", "10,10.0", "20,20.0", "30,31.0"]
 
 
+DAMAGED = {
+    "empty": ("", 0),
+    "binary": (bytes(range(256)).decode("latin-1"), 0),
+    "without steps": ("train/loss,val/loss\n1,2\n", 0),
+    "two columns of one name": ("step,a,a\n10,1,2\n", 0),
+    "a row of words in the middle": ("step,a\n10,1.0\nso,what\n20,2.0\n", 2),
+    "a row with too many values": ("step,a\n10,1.0\n15,1,2\n20,2.0\n", 2),
+    "bytes that are no text": ("step,a\n10,1.0\n15,\udcff\n20,2.0\n", 2),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_damaged_curves_are_set_aside_and_whole_rows_kept(
+    damage: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text, kept = DAMAGED[damage]
+    content = text.encode("latin-1" if damage == "binary" else "utf-8", "surrogateescape")
+    path = tmp_path / "curves.csv"
+    path.write_bytes(content)
+    curves = Curves(path, step=20)
+    assert [row["step"] for row in curves.rows] == ["10", "20"][:kept]
+    curves.log_metrics({"a": 3.0}, 30)
+    assert lines(path)[-1].startswith("30,")
+    aside = tmp_path / "curves.damaged.csv"
+    assert aside.exists() == bool(content)
+    if content:
+        assert aside.read_bytes() == content
+
+
+def test_a_value_may_be_logged_late(tmp_path: Path) -> None:
+    curves = Curves(tmp_path / "curves.csv")
+    curves.log_metrics({"a": 1.0}, 10)
+    curves.log_metrics({"a": 3.0}, 30)
+    curves.log_metrics({"a": 2.0}, 20)
+    curves.log_metrics({"b": 1.5}, 10)
+    curves.log_metrics({"a": 0.0}, 5)
+    assert lines(tmp_path / "curves.csv") == ["step,a,b", "5,0.0,", "10,1.0,1.5", "20,2.0,", "30,3.0,"]
+
+
 def test_curves_need_a_step(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="needs a step"):
         Curves(tmp_path / "curves.csv").log_metrics({"a": 1.0})
