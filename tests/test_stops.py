@@ -227,7 +227,12 @@ def test_a_request_swallowed_at_the_very_end_leaves_a_finished_run_and_ends_the_
 
 def start(folder: Path, *words: str, **variables: str) -> subprocess.Popen[str]:
     """Trains in a process group of its own."""
-    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "OMP_NUM_THREADS": "1", "TINY_PAUSE": "0.2"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{REPOSITORY / 'src'}{os.pathsep}{REPOSITORY}",
+        "OMP_NUM_THREADS": "1",
+        "TINY_PAUSE": "0.2",
+    }
     return subprocess.Popen(
         [sys.executable, "-c", "from apex_lab.train import main; main()", *TINY, *words],
         cwd=folder,

@@ -275,7 +275,13 @@ def _loggers(run: Run, model: SceneModel, step: int) -> list[Logger]:
         )
         for name, node in config.logger.items()
     ]
-    return [*([Curves(run.curves_file, step)] if model.needs_training else []), *built]
+    if not model.needs_training:
+        return built
+    curves = Curves(run.curves_file, step)
+    for logger in built:
+        if isinstance(logger, Wandb) and curves.open_row is not None:
+            logger.log_metrics(curves.open_row[1], curves.open_row[0])
+    return [curves, *built]
 
 
 def _callbacks(run: Run) -> list[L.Callback]:

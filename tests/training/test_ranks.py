@@ -29,7 +29,12 @@ WORDS = (
 
 
 def start(folder: Path, *words: str, pause: float = 0.0) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": f"{REPOSITORY}", "OMP_NUM_THREADS": "1", "TINY_PAUSE": str(pause)}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{REPOSITORY / 'src'}{os.pathsep}{REPOSITORY}",
+        "OMP_NUM_THREADS": "1",
+        "TINY_PAUSE": str(pause),
+    }
     program = (sys.executable, "-m", "apex_lab.train", *WORDS, *words)
     return subprocess.Popen(
         program, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

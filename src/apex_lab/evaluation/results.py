@@ -93,19 +93,25 @@ def store(
     return scored
 
 
+def _whole(scored: object) -> bool:
+    """Whether an entry of metrics.json's `splits` is one."""
+    return isinstance(scored, dict) and isinstance(scored.get("total"), dict)
+
+
 def _stored(path: Path) -> dict[str, Any]:
     """What is there already; a damaged file is set aside, so that the work that was just done is not lost."""
     if not path.exists():
         return {}
     try:
         content = read_json(path)
-        if isinstance(content.get("splits", {}), dict):
-            return content
     except UserError:
-        pass
+        content = {"splits": None}
+    splits = content.get("splits", {})
+    if isinstance(splits, dict) and all(_whole(scored) for scored in splits.values()):
+        return content
     aside = set_aside(path)
     console.warn(f"{path} was damaged and is set aside as {aside.name}: evaluate other splits that it held again.")
-    return {}
+    return {"splits": {k: v for k, v in splits.items() if _whole(v)} if isinstance(splits, dict) else {}}
 
 
 def unlabelled(tally: Tally) -> dict[str, Any]:

@@ -195,8 +195,9 @@ class Run:
             splits = read_json(self.metrics_file).get("splits")
         except UserError:
             return False
-        scored = splits.get(self.job.config.evaluation.split) if isinstance(splits, dict) else None
-        return isinstance(scored, dict) and isinstance(scored.get("total"), dict)
+        if not isinstance(splits, dict) or self.job.config.evaluation.split not in splits:
+            return False
+        return all(isinstance(scored, dict) and isinstance(scored.get("total"), dict) for scored in splits.values())
 
     def start(self, command: str, device: torch.device) -> None:
         """Records that work begins or resumes, and with what."""

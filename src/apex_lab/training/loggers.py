@@ -32,6 +32,10 @@ class Curves(Logger):
     Args:
         path: the file; rows that are there already are kept up to `step`.
         step: the step that a run resumes from; later rows belong to work that was lost and will be done again.
+
+    Attributes:
+        open_row: step and values of the last row where no later one was logged before the run was resumed. Loggers that
+            keep a step's values until the next step may have lost it by a kill.
     """
 
     def __init__(self, path: Path, step: int = 0) -> None:
@@ -39,6 +43,7 @@ class Curves(Logger):
         self.path = path
         self.rows: list[dict[str, float | int | str]] = []
         self.columns = ["step"]
+        self.open_row: tuple[int, dict[str, float]] | None = None
         if path.is_file():
             columns, rows, damaged = _read_curves(path)
             if damaged:
@@ -46,6 +51,9 @@ class Curves(Logger):
                 console.warn(f"{path} is damaged and was set aside as {aside.name}; {len(rows)} rows of it are whole.")
             self.columns = columns
             self.rows = [dict(row) for row in rows if int(row["step"]) <= step]
+            if rows and len(self.rows) == len(rows):
+                values = {name: float(value) for name, value in rows[-1].items() if value and name != "step"}
+                self.open_row = int(rows[-1]["step"]), values
         self._rewrite()
 
     @property
@@ -128,6 +136,10 @@ TIMEOUT = 30.0
 """Seconds that wandb's server has to answer before a run is logged offline; ten times that for the last upload."""
 
 
+FLUSH = 0.2
+"""Seconds that values wait in wandb's process before they are in an offline run's file; a kill can cost that much."""
+
+
 class Wandb(Logger):
     """Weights & Biases; a network that is away or credentials that are missing never stop a run.
 
@@ -170,7 +182,7 @@ class Wandb(Logger):
         words: dict[str, Any] = {
             "project": project,
             "entity": entity,
-            "dir": str(self._run.folder),
+            "dir": str(self._run.folder.resolve()),  # wandb's own process has a working folder of its own
             "group": group_name(job),
             "name": f"{group_name(job)}_seed_{job.config.seed}",
             "job_type": "train",
@@ -187,6 +199,7 @@ class Wandb(Logger):
             console="off",
             disable_git=True,
             save_code=False,
+            x_transaction_log_flush_interval=FLUSH,
         )
         try:
             started = wandb.init(mode=mode, settings=settings, **words)
