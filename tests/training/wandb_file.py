@@ -43,7 +43,14 @@ def _contents(data: bytes) -> Iterator[bytes]:
 
 
 def _values(items: Any) -> dict[str, Any]:
-    return {item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items}
+    values: dict[str, Any] = {}
+    for item in items:
+        *path, last = item.nested_key or [item.key]
+        inside = values
+        for key in path:
+            inside = inside.setdefault(key, {})
+        inside[last] = json.loads(item.value_json)
+    return values
 
 
 def history(found: list[pb.Record]) -> list[dict[str, Any]]:
