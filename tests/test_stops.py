@@ -149,6 +149,18 @@ def test_variables_of_a_cluster_change_nothing(
     assert record(the_run())["steps"] == 2
 
 
+def test_ranks_that_do_not_fit_are_refused(
+    train: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value in {"RANK": "0", "WORLD_SIZE": "2"}.items():
+        monkeypatch.setenv(name, value)
+    ended = train()
+    assert ended.code == 1
+    assert "2 processes were started (WORLD_SIZE), but trainer.devices = 1" in ended.err
+    assert len(ended.err.splitlines()) == 1
+    assert not (tmp_path / "outputs").exists()
+
+
 @pytest.mark.parametrize(
     ("step", "number"),
     [

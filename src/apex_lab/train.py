@@ -64,6 +64,7 @@ def train(job: Job) -> Outcome:
             finished before that.
     """
     outside = ranks.given()
+    ranks.check_given(outside, job.config.trainer.devices, job.config.trainer.num_nodes)
     if outside is not None and outside.rank > 0:
         file = ranks.wait_for(ranks.job_file(run_folder(job)))
         with deferring():
