@@ -45,7 +45,12 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
 
 def start(folder: Path, *words: str, code: str = "from apex_lab.train import main; main()") -> subprocess.Popen[str]:
     """Trains the tiny model in a process of its own, which can be killed."""
-    environment = {**os.environ, "PYTHONPATH": f"{REPOSITORY}", "OMP_NUM_THREADS": "1", "TINY_PAUSE": "0.2"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{REPOSITORY / 'src'}{os.pathsep}{REPOSITORY}",
+        "OMP_NUM_THREADS": "1",
+        "TINY_PAUSE": "0.2",
+    }
     return subprocess.Popen(
         [sys.executable, "-c", code, *TINY, *words],
         cwd=folder,

@@ -6,7 +6,9 @@ python -m apex_lab.train +ablation=no_entropy seed=0,1,2,3 scale=cpu -m
 
 from __future__ import annotations
 
+import time
 import traceback
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -14,10 +16,10 @@ import torch
 from lightning.pytorch.loggers import Logger
 
 from apex_lab import evaluation
-from apex_lab.base import console
+from apex_lab.base import console, interrupts
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
-from apex_lab.base.interrupts import Deferred, Interrupted, deferring
+from apex_lab.base.interrupts import Interrupted, deferring, interruptible
 from apex_lab.base.validation import one_line
 from apex_lab.config import command_line as cli
 from apex_lab.config import components, trust
@@ -35,7 +37,7 @@ from apex_lab.training import callbacks as own_callbacks
 from apex_lab.training import estimate, ranks, worker
 from apex_lab.training.fit import fit
 from apex_lab.training.learner import Diverged
-from apex_lab.training.loggers import Curves, Wandb
+from apex_lab.training.loggers import Curves, Wandb, closing
 
 
 def main() -> None:
@@ -50,32 +52,57 @@ def title(job: Job) -> str:
     return f"{group_name(job)}, seed {job.config.seed}"
 
 
-def train(job: Job) -> None:
+def train(job: Job) -> Outcome:
     """Starts a run, resumes it where it stopped, or shows the scores of a finished one.
+
+    Returns:
+        "finished", or "paused" when `trainer.max_minutes` were over before training was.
 
     Raises:
         UserError: the run cannot be done as asked; one sentence.
+        Interrupted: the process was asked to stop. What is stored stays, and a run that came to its end is recorded as
+            finished before that.
     """
     outside = ranks.given()
+    ranks.check_given(outside, job.config.trainer.devices, job.config.trainer.num_nodes)
     if outside is not None and outside.rank > 0:
-        worker.train_along(ranks.wait_for(ranks.job_file(run_folder(job))), outside, _named(job))
-        return
-    with Run(job) as run:
+        file = ranks.wait_for(ranks.job_file(run_folder(job)))
+        with deferring():
+            worker.train_along(file, outside, _named(job))
+        return "finished"
+    began = time.monotonic()
+    with interruptible(), Run(job) as run:
         if run.finished:
             console.say(f"finished already: {run.folder}")
             _show(run)
-            return
+            return "finished"
         device = device_of(job.config.trainer.accelerator)
         run.start(cli.command_line(), device)
         with beating(run.folder), console.log_to(run.folder / "log.txt"):
             try:
-                _train(run, device)
+                outcome = _train(run, device, began)
             except BaseException as error:
-                run.fail(*_reason(error))
+                stop = _stop(error)
+                run.fail(*_reason(stop or error))
                 console.note(traceback.format_exc())
+                if stop is not None:
+                    raise stop from error
                 raise
+            if outcome == "paused":
+                run.pause(f"stopped after {job.config.trainer.max_minutes:g} minutes (trainer.max_minutes)")
+                console.say(f"paused at step {run.record['steps']}: {run.record['reason']}; the same command resumes.")
+                return "paused"
             run.finish()
             _show(run)
+    return "finished"
+
+
+def _stop(error: BaseException) -> Interrupted | None:
+    """A request to stop that ended in another error: the signal has reached processes that this one needs too."""
+    signum = interrupts.asked()
+    if signum is None or isinstance(error, Interrupted | UserError):
+        return None
+    return Interrupted(signum)
 
 
 def _named(job: Job) -> list[str]:
@@ -91,11 +118,12 @@ def _reason(error: BaseException) -> tuple[str, Outcome]:
     return f"{type(error).__name__}: {one_line(error)}", "failed"
 
 
-def _train(run: Run, device: torch.device) -> None:
+def _train(run: Run, device: torch.device, began: float) -> Outcome:
     config = run.job.config
     checkpoint = _checkpoint(run)
     if checkpoint is not None:
         _compare_configuration(run, checkpoint)
+        run.restore(checkpoint["step"], checkpoint["training"])
     console.say(f"{title(run.job)} on {device.type}: {run.folder}")
     model = build_model(config)
     if model.needs_training and checkpoint is None and device.type == "cpu":
@@ -105,22 +133,23 @@ def _train(run: Run, device: torch.device) -> None:
     source: VideoSource = components.build(config.data, "data")
     source.prepare()
     source.open()
+    interrupts.check()
     _compare_data(run, source.fingerprint, checkpoint)
     if checkpoint is None:
         model.initialise(Statistics(lambda: _median(source, model)))
     else:
         _load_weights(run, model, checkpoint["inference"]["weights"])
         console.say(f"resuming from step {checkpoint['step']}")
-    loggers: list[Logger] = []
-    if model.needs_training:
-        loggers = _loggers(run, checkpoint["step"] if checkpoint else 0)
-        _fit(run, model, source, checkpoint, loggers, device)
-    else:
-        checkpoints.save(run.last, _untrained(run, model))
-    scores = _evaluate(run, model, source, device)
-    for logger in loggers:
-        if isinstance(logger, Wandb):
-            logger.end(scores)
+    with closing(_loggers(run, model, checkpoint["step"] if checkpoint else 0)) as loggers:
+        if not model.needs_training:
+            checkpoints.save(run.last, _untrained(run, model))
+        elif not _fit(run, model, source, checkpoint, loggers, device, began):
+            return "paused"
+        scored, pictures = _evaluate(run, model, source, device)
+        for logger in loggers:
+            if isinstance(logger, Wandb):
+                logger.results(config.evaluation.split, scored, pictures, run.record["steps"])
+    return "finished"
 
 
 def _median(source: VideoSource, model: SceneModel) -> torch.Tensor:
@@ -135,13 +164,15 @@ def _fit(
     checkpoint: dict[str, Any] | None,
     loggers: list[Logger],
     device: torch.device,
-) -> None:
-    """All weight updates that are left."""
+    began: float,
+) -> bool:
+    """The weight updates that are left, or those that `trainer.max_minutes` allow; whether training came to its end."""
     config, settings = run.job.config, run.job.config.trainer
     start = checkpoint["step"] if checkpoint else 0
-    if start >= settings.max_steps:
-        return
     training = checkpoint["training"] if checkpoint else None
+    if start >= settings.max_steps or (training is not None and training.get("ended")):
+        return True
+    deadline = None if settings.max_minutes is None else began + 60 * settings.max_minutes
     job = {
         "config": config.model_dump(),
         "weights": model.state_dict(),
@@ -149,17 +180,21 @@ def _fit(
         "step": start,
         "training": training,
     }
-    with deferring() as deferred, ranks.started(job, settings.devices, settings.num_nodes, run.folder) as mine:
-        callbacks = _callbacks(run, training, deferred)
-        fit(config, model, source, device, start, training, mine, callbacks, loggers, run.folder)
+    with deferring(), ranks.started(job, settings.devices, settings.num_nodes, run.folder) as mine:
+        callbacks, keep = _callbacks(run), _checkpoints(run, training)
+        return fit(config, model, source, device, start, training, mine, callbacks, keep, loggers, run.folder, deadline)
 
 
-def _evaluate(run: Run, model: SceneModel, source: VideoSource, device: torch.device) -> dict[str, float]:
-    """Scores and pictures of the final weights, in the run's folder; the paper's four scores."""
+def _evaluate(
+    run: Run, model: SceneModel, source: VideoSource, device: torch.device
+) -> tuple[dict[str, Any], list[Path]]:
+    """Scores and pictures of the final weights, in the run's folder: what metrics.json holds, and the pictures."""
     config = run.job.config
     asked = config.evaluation
-    schedule = schedule_at({n: s(config.trainer.max_steps) for n, s in build_schedules(config).items()}, device)
-    scored, _ = evaluation.evaluate(
+    # a callback may have ended training before the last step
+    step = run.record["steps"] if model.needs_training else config.trainer.max_steps
+    schedule = schedule_at({n: s(step) for n, s in build_schedules(config).items()}, device)
+    return evaluation.evaluate(
         evaluation.Asked(
             folder=run.folder,
             split=asked.split,
@@ -173,7 +208,6 @@ def _evaluate(run: Run, model: SceneModel, source: VideoSource, device: torch.de
         Predictor(model, schedule, device, config.trainer.precision, seed=config.seed, chunk=asked.chunk),
         whole_loader(source.sets[asked.split], asked.batch_size, asked.videos),
     )
-    return {f"{asked.split}/{key}": scored["total"][key] for key in evaluation.COLUMNS if key in scored["total"]}
 
 
 def _show(run: Run) -> None:
@@ -238,7 +272,8 @@ def _compare_data(run: Run, found: str, checkpoint: dict[str, Any] | None) -> No
     run.update(data_fingerprint=found)
 
 
-def _loggers(run: Run, step: int) -> list[Logger]:
+def _loggers(run: Run, model: SceneModel, step: int) -> list[Logger]:
+    """Where values go; a model that does not train has no curves."""
     config = run.job.config
     built = [
         components.build(
@@ -246,23 +281,31 @@ def _loggers(run: Run, step: int) -> list[Logger]:
         )
         for name, node in config.logger.items()
     ]
-    return [Curves(run.curves_file, step), *built]
+    if not model.needs_training:
+        return built
+    curves = Curves(run.curves_file, step)
+    for logger in built:
+        if isinstance(logger, Wandb) and curves.open_row is not None:
+            logger.log_metrics(curves.open_row[1], curves.open_row[0])
+    return [curves, *built]
 
 
-def _callbacks(run: Run, training: dict[str, Any] | None, deferred: Deferred) -> list[L.Callback]:
-    config = run.job.config
-    settings = config.trainer
-    keep = own_callbacks.Checkpoints(
+def _callbacks(run: Run) -> list[L.Callback]:
+    """Those of the configuration."""
+    return [components.build(node, f"callbacks.{name}") for name, node in run.job.config.callbacks.items()]
+
+
+def _checkpoints(run: Run, training: dict[str, Any] | None) -> own_callbacks.Checkpoints:
+    settings = run.job.config.trainer
+    return own_callbacks.Checkpoints(
         run,
         settings.checkpoint_interval,
         settings.validation_interval,
         settings.max_steps,
         settings.monitor,
         settings.monitor_mode,
-        deferred,
         training,
     )
-    return [keep, *(components.build(node, f"callbacks.{name}") for name, node in config.callbacks.items())]
 
 
 if __name__ == "__main__":

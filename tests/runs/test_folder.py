@@ -79,7 +79,12 @@ def test_a_record_goes_from_running_to_its_end(job: Job) -> None:
         run.finish()
         assert not run.finished  # no results yet
         run.metrics_file.write_text("{}")
+        assert not run.finished
+        run.metrics_file.write_text('{"splits": {"test": {"total": {}}}}')
         assert run.finished
+        run.pause("time is up")
+        assert (run.record["status"], run.record["outcome"]) == ("paused", "paused")
+        assert not run.finished
 
 
 def test_what_a_kill_left_half_written_is_removed(job: Job) -> None:

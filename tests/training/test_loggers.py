@@ -1,13 +1,17 @@
 from __future__ import annotations
 
+import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from apex_lab.training.loggers import Curves, credentials
-from tests.conftest import Ended
+from tests.conftest import TINY, Ended
+from tests.test_train import start, wait_for_step
+from tests.training import wandb_file
 
 
 def lines(path: Path) -> list[str]:
@@ -37,6 +41,45 @@ def test_curves_of_a_resumed_run_lose_what_will_be_done_again(tmp_path: Path) ->
     assert lines(path) == ["step,train/loss", "10,10.0", "20,20.0", "30,31.0"]
 
 
+DAMAGED = {
+    "empty": ("", 0),
+    "binary": (bytes(range(256)).decode("latin-1"), 0),
+    "without steps": ("train/loss,val/loss\n1,2\n", 0),
+    "two columns of one name": ("step,a,a\n10,1,2\n", 0),
+    "a row of words in the middle": ("step,a\n10,1.0\nso,what\n20,2.0\n", 2),
+    "a row with too many values": ("step,a\n10,1.0\n15,1,2\n20,2.0\n", 2),
+    "bytes that are no text": ("step,a\n10,1.0\n15,\udcff\n20,2.0\n", 2),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGED)
+def test_damaged_curves_are_set_aside_and_whole_rows_kept(
+    damage: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    text, kept = DAMAGED[damage]
+    content = text.encode("latin-1" if damage == "binary" else "utf-8", "surrogateescape")
+    path = tmp_path / "curves.csv"
+    path.write_bytes(content)
+    curves = Curves(path, step=20)
+    assert [row["step"] for row in curves.rows] == ["10", "20"][:kept]
+    curves.log_metrics({"a": 3.0}, 30)
+    assert lines(path)[-1].startswith("30,")
+    aside = tmp_path / "curves.damaged.csv"
+    assert aside.exists() == bool(content)
+    if content:
+        assert aside.read_bytes() == content
+
+
+def test_a_value_may_be_logged_late(tmp_path: Path) -> None:
+    curves = Curves(tmp_path / "curves.csv")
+    curves.log_metrics({"a": 1.0}, 10)
+    curves.log_metrics({"a": 3.0}, 30)
+    curves.log_metrics({"a": 2.0}, 20)
+    curves.log_metrics({"b": 1.5}, 10)
+    curves.log_metrics({"a": 0.0}, 5)
+    assert lines(tmp_path / "curves.csv") == ["step,a,b", "5,0.0,", "10,1.0,1.5", "20,2.0,", "30,3.0,"]
+
+
 def test_curves_need_a_step(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="needs a step"):
         Curves(tmp_path / "curves.csv").log_metrics({"a": 1.0})
@@ -62,7 +105,9 @@ def offline_folders(run: Path) -> list[Path]:
     return sorted((run / "wandb").glob("offline-run-*"))
 
 
-def test_wandb_without_credentials_is_offline_and_keeps_its_id(
+@pytest.mark.parametrize("killed", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_wandb_offline_is_complete_also_after_a_kill_and_resumption(
+    killed: bool,
     train: Callable[..., Ended],
     the_run: Callable[..., Path],
     monkeypatch: pytest.MonkeyPatch,
@@ -70,21 +115,76 @@ def test_wandb_without_credentials_is_offline_and_keeps_its_id(
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
-    monkeypatch.setenv("TINY_BROKEN_AT", "5")
-    assert train("logger=wandb").code == 1
-    run = the_run()
+    words = ("logger=wandb", "trainer.max_steps=12", "trainer.checkpoint_interval=3", "evaluation.pictures=1")
+    if killed:
+        process = start(tmp_path, *words)
+        run = wait_for_step(tmp_path, 6)
+        process.kill()
+        process.communicate()
+    else:
+        monkeypatch.setenv("TINY_BROKEN_AT", "7")
+        assert train(*words).code == 1
+        monkeypatch.delenv("TINY_BROKEN_AT")
+        run = the_run()
     name = json.loads((run / "run.json").read_text())["wandb_id"]
-    monkeypatch.delenv("TINY_BROKEN_AT")
-    ended = train("logger=wandb")
-    assert ended.code == 0
+    (run / "run.json").unlink()  # the checkpoint knows the id too
+    ended = train(*words)
+    assert ended.code == 0, ended.err
     assert "wandb: no credentials, logging offline" in ended.out
     assert json.loads((run / "run.json").read_text())["wandb_id"] == name
     folders = offline_folders(run)
     assert len(folders) == 2
-    assert all(folder.name.endswith(name) for folder in folders)
-    stored = (folders[1] / f"run-{name}.wandb").read_bytes()
-    for word in (run.parent.name, "train/loss", "val/ari_fg", "smoke"):
-        assert word.encode() in stored, word
+    first, second = (wandb_file.records(folder / f"run-{name}.wandb") for folder in folders)
+    resumed = int(ended.out.split("resuming from step ")[1].split()[0])
+    for part in (first, second):
+        about = wandb_file.run(part)
+        assert (about.run_id, about.project, about.job_type) == (name, "apex_lab", "train")
+        assert about.run_group == run.parent.name
+        assert about.display_name == f"{run.parent.name}_seed_0"
+        assert set(about.tags) == {"tiny", "squares", "smoke"}
+        assert wandb_file.config(part)["trainer"]["max_steps"] == 12
+        steps = [row["_step"] for row in wandb_file.history(part)]
+        assert steps == sorted(steps)
+        assert steps == [row["step"] for row in wandb_file.history(part)]
+    assert wandb_file.history(first)[0]["_step"] == 1
+    # wandb keeps the values of a step until the next one, so the last row may come again
+    assert wandb_file.history(second)[0]["_step"] in (resumed, resumed + 1)
+    with open(run / "curves.csv", newline="") as file:
+        rows = {int(row["step"]): row for row in csv.DictReader(file)}
+    sent: dict[int, dict[str, Any]] = {}
+    for row in (*wandb_file.history(first), *wandb_file.history(second)):
+        sent.setdefault(row["_step"], {}).update(row)
+    assert sorted(sent) == sorted(rows) == list(range(1, 13))
+    for step, row in rows.items():
+        for key, value in row.items():
+            if value and key != "train/frames_per_second":
+                assert sent[step][key] == float(value), (step, key)
+    scored = json.loads((run / "metrics.json").read_text())["splits"]["test"]
+    final = wandb_file.summary(second)
+    for key, value in scored["total"].items():
+        if isinstance(value, int | float):
+            assert final[f"test/{key}"] == value, key
+    shown = wandb_file.history(second)[-1]
+    files = folders[1] / "files"
+    assert (shown["test/film_strip"]["_type"], shown["test/movie"]["_type"]) == ("image-file", "video-file")
+    assert (files / shown["test/film_strip"]["path"]).read_bytes() == (run / "view" / "film_strip.png").read_bytes()
+    table = json.loads((files / shown["test/per_video"]["path"]).read_text())
+    place = table["columns"].index("ari_fg")
+    assert [row[place] for row in table["data"]] == [row["ari_fg"] for row in scored["per_video"]]
+
+
+def test_wandb_takes_the_scores_of_a_model_that_does_not_train(
+    command: Callable[..., Ended],
+    the_run: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
+    assert command("train", *TINY, "model=one_segment", "logger=wandb").code == 0
+    [folder] = offline_folders(the_run())
+    [file] = folder.glob("*.wandb")
+    assert "test/ari" in wandb_file.summary(wandb_file.records(file))
 
 
 def test_wandb_with_a_network_that_is_away_falls_back_to_offline(

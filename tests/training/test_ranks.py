@@ -29,7 +29,12 @@ WORDS = (
 
 
 def start(folder: Path, *words: str, pause: float = 0.0) -> subprocess.Popen[str]:
-    environment = {**os.environ, "PYTHONPATH": f"{REPOSITORY}", "OMP_NUM_THREADS": "1", "TINY_PAUSE": str(pause)}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": f"{REPOSITORY / 'src'}{os.pathsep}{REPOSITORY}",
+        "OMP_NUM_THREADS": "1",
+        "TINY_PAUSE": str(pause),
+    }
     program = (sys.executable, "-m", "apex_lab.train", *WORDS, *words)
     return subprocess.Popen(
         program, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -105,6 +110,25 @@ def test_killed_and_resumed_they_end_as_unbroken(one_process: Path, tmp_path: Pa
     assert process.returncode == 0, errors
     assert "resuming from step" in out
     equal(tmp_path / "outputs", one_process)
+
+
+@pytest.mark.slow
+def test_callbacks_and_time_limits_stop_all_ranks_at_once(tmp_path: Path) -> None:
+    early = (
+        "trainer.devices=2",
+        "trainer.validation_interval=3",
+        "+callbacks.early._target_=lightning.pytorch.callbacks.EarlyStopping",
+        "+callbacks.early.monitor=val/loss",
+        "+callbacks.early.patience=2",
+        "+callbacks.early.min_delta=1000000.0",
+    )
+    for words, status, step in ((("trainer.max_minutes=1e-6",), "paused", 1), ((), "finished", 9)):
+        process = start(tmp_path, *early, *words)
+        _, errors = process.communicate(timeout=200)
+        assert process.returncode == 0, errors
+        [record] = [json.loads(path.read_text()) for path in tmp_path.glob("outputs/*/seed_0/run.json")]
+        assert (record["status"], record["steps"]) == (status, step)
+    assert not _workers(tmp_path)
 
 
 def _workers(folder: Path) -> list[str]:

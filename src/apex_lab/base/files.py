@@ -81,6 +81,24 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
+def set_aside(path: Path) -> Path:
+    """Renames a damaged file, so that a sound one can take its place; nothing of it is lost.
+
+    Returns:
+        Its new path: `curves.damaged.csv` for `curves.csv`, with a number where that is taken.
+    """
+    aside = path.with_name(f"{path.stem}.damaged{path.suffix}")
+    number = 2
+    while aside.exists():
+        aside = path.with_name(f"{path.stem}.damaged_{number}{path.suffix}")
+        number += 1
+    try:
+        os.replace(path, aside)
+    except OSError as error:
+        raise unwritable(path, error) from error
+    return aside
+
+
 def make_folder(path: Path) -> Path:
     """Makes a folder with its parents.
 

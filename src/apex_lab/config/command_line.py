@@ -25,7 +25,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from apex_lab.base import console
+from apex_lab.base import console, interrupts
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.interrupts import Interrupted, interruptible
 from apex_lab.base.validation import did_you_mean, one_line, sentence
@@ -81,6 +81,7 @@ def launch(command: Command) -> None:
     failed = False
 
     def task(config: DictConfig) -> str:
+        interrupts.check()
         console.setup()  # the launcher may have put this job into a process of its own
         overrides = list(HydraConfig.get().overrides.task)
         try:

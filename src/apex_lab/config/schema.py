@@ -40,6 +40,7 @@ class TrainerPart(_Part):
     compile: bool
     cuda_graph: bool = False
     max_steps: int = Field(ge=1)
+    max_minutes: float | None = Field(default=None, gt=0)
     gradient_clip_norm: float | None = Field(gt=0)
     log_interval: int = Field(ge=1)
     validation_interval: int | None = Field(ge=1)
@@ -301,6 +302,18 @@ def _check_components(config: Config) -> None:
         components.check(node, f"logger.{name}", supplied=["run"])
     for name, node in config.callbacks.items():
         components.check(node, f"callbacks.{name}")
+        _refuse_checkpoints(node, f"callbacks.{name}")
+
+
+def _refuse_checkpoints(node: Mapping[str, Any], key: str) -> None:
+    """A second writer of checkpoints would meet the files that a run resumes from."""
+    classes = getattr(components.target_of(node, key), "__mro__", ())
+    # by name, since this module needs no Lightning
+    if any(one.__name__ == "Checkpoint" and one.__module__.endswith(".callbacks.checkpoint") for one in classes):
+        raise UserError(
+            f"{key}: a run keeps its checkpoints itself (trainer.checkpoint_interval, trainer.monitor): "
+            f"leave {node['_target_']} out."
+        )
 
 
 def _check_objective(config: Config) -> None:
@@ -327,8 +340,9 @@ def _check_objective(config: Config) -> None:
     _same_names("schedule", schedules, model.schedule_ranges)
     _same_names("loss", weights, model.term_names)
     if model.needs_training:
+        _check_early_stopping(config, model)
         build_optimizer(config, [(name, p) for name, p in model.named_parameters() if p.requires_grad])
-        _check_monitor(config.trainer, model)
+        _check_monitor("trainer.monitor", config.trainer.monitor, model)
         _check_clips(config)
         _check_ranks(config, model)
 
@@ -384,12 +398,23 @@ def _check_range(key: str, schedule: Callable[[int], float], limits: tuple[float
             raise UserError(f"{key} is {value:g} at step {step}: it must be {reach}.")
 
 
-def _check_monitor(trainer: TrainerPart, model: SceneModel) -> None:
-    """The score that decides on best.ckpt must be one that validation gives."""
+def _check_monitor(key: str, monitor: object, model: SceneModel) -> None:
+    """The score that decides on best.ckpt, or on stopping early, must be one that validation gives."""
     known = [f"val/{name}" for name in (*VALIDATION_SCORES, "foreground_share", "loss", *model.term_names)]
-    if trainer.monitor not in known:
-        guess = did_you_mean(trainer.monitor, known)
-        raise UserError(sentence(f"trainer.monitor = '{trainer.monitor}' is none of {', '.join(known)}{guess}"))
+    if monitor not in known:
+        guess = did_you_mean(str(monitor), known)
+        raise UserError(sentence(f"{key} = '{monitor}' is none of {', '.join(known)}{guess}"))
+
+
+def _check_early_stopping(config: Config, model: SceneModel) -> None:
+    """Lightning's early stopping finds out only at the first validation that there is no such score."""
+    for name, node in config.callbacks.items():
+        if str(node["_target_"]).endswith(".EarlyStopping") and "monitor" in node:
+            _check_monitor(f"callbacks.{name}.monitor", node["monitor"], model)
+            if config.trainer.validation_interval is None:
+                raise UserError(
+                    f"callbacks.{name} looks at validation's scores: set trainer.validation_interval, or leave it out."
+                )
 
 
 def _check_splits(config: Config) -> None:

@@ -36,6 +36,7 @@ EXCLUDED = (
     "trainer.num_nodes",
     "trainer.log_interval",
     "trainer.checkpoint_interval",
+    "trainer.max_minutes",
     "evaluation.pictures",
     "evaluation.batch_size",
     "evaluation.chunk",

@@ -210,7 +210,8 @@ def _folder(
     run = run_folder(file)
     in_run = (run / "run.json").is_file()
     usual = request.scoring == ScoringPart()
-    ended = content["step"] >= job.config.trainer.max_steps or not model.needs_training
+    early = (content["training"] or {}).get("ended", False)  # a callback may end training
+    ended = early or content["step"] >= job.config.trainer.max_steps or not model.needs_training
     if in_run and file.name == "last.ckpt" and ended and usual and request.videos is None and not request.data:
         return run
     words = [file.stem if in_run and ended else of_file, request.split]

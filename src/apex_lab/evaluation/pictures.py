@@ -9,14 +9,16 @@ from typing import Any, NamedTuple
 
 from torch.utils.data import default_collate
 
+from apex_lab.base import console, interrupts
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder
 from apex_lab.base.signed import is_signed
+from apex_lab.base.validation import one_line, sentence
 from apex_lab.data.video_set import VideoSet
 from apex_lab.inference.predictor import Predictor
 from apex_lab.metrics import KEYS
 from apex_lab.view import Item, render_all
-from apex_lab.view.curves import has_rows
+from apex_lab.view.curves import has_rows, read_curves
 from apex_lab.view.item import one_video
 
 PICTURES_BY = "ari_fg"
@@ -91,6 +93,7 @@ def draw(
         return []
     items = []
     for title, name, value in chosen:
+        interrupts.check()
         batch = default_collate([videos[positions[name]]])
         scene = one_video(predictor(batch, detail=True), 0)
         caption = f"{title} {name}" if math.isnan(value) else f"{title} {name} ({key} {value:.2f})"
@@ -98,4 +101,16 @@ def draw(
     for old in make_folder(folder).glob("components_*.png"):
         if is_signed(old):
             old.unlink()
-    return render_all(folder, items, curves if curves is not None and has_rows(curves) else None)
+    return render_all(folder, items, _readable(curves))
+
+
+def _readable(curves: Path | None) -> Path | None:
+    """The table of curves if it can be drawn; a damaged one costs its page alone."""
+    if curves is None or not has_rows(curves):
+        return None
+    try:
+        read_curves(curves)
+    except UserError as error:
+        console.warn(sentence(f"{one_line(error)}; the page of curves is left out"))
+        return None
+    return curves

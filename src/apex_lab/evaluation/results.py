@@ -9,7 +9,9 @@ from typing import Any
 
 import pandas as pd
 
-from apex_lab.base.files import make_folder, read_json, write_json, write_text
+from apex_lab.base import console
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import make_folder, read_json, set_aside, write_json, write_text
 from apex_lab.evaluation.pictures import Chosen
 from apex_lab.evaluation.score import Tally
 from apex_lab.formats.scored_files import plain
@@ -58,7 +60,7 @@ def store(
         What metrics.json holds of the split.
     """
     path = make_folder(folder) / "metrics.json"
-    content = read_json(path) if path.exists() else {}
+    content = _stored(path)
     videos = [
         {
             **row,
@@ -89,6 +91,27 @@ def store(
     top = {"settings": scored["settings"], "versions": scored["versions"], **(beside or {})}
     write_json(path, {**content, **top, "splits": {**content.get("splits", {}), split: scored}})
     return scored
+
+
+def _whole(scored: object) -> bool:
+    """Whether an entry of metrics.json's `splits` is one."""
+    return isinstance(scored, dict) and isinstance(scored.get("total"), dict)
+
+
+def _stored(path: Path) -> dict[str, Any]:
+    """What is there already; a damaged file is set aside, so that the work that was just done is not lost."""
+    if not path.exists():
+        return {}
+    try:
+        content = read_json(path)
+    except UserError:
+        content = {"splits": None}
+    splits = content.get("splits", {})
+    if isinstance(splits, dict) and all(_whole(scored) for scored in splits.values()):
+        return content
+    aside = set_aside(path)
+    console.warn(f"{path} was damaged and is set aside as {aside.name}: evaluate other splits that it held again.")
+    return {"splits": {k: v for k, v in splits.items() if _whole(v)} if isinstance(splits, dict) else {}}
 
 
 def unlabelled(tally: Tally) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from jaxtyping import Int
 from torch import Tensor
 from torch.utils.data import DataLoader, Subset
 
+from apex_lab.base import interrupts
 from apex_lab.base.errors import UserError
 from apex_lab.base.progress import Meter
 from apex_lab.base.validation import one_line
@@ -118,6 +119,7 @@ def score(predictor: Predictor, batches: Batches, scoring: ScoringPart, parts: P
         for batch in _rest(batches, len(tally)):
             fresh += add_batch(tally, predictor, batch, videos, scoring)
             meter.show(len(tally))
+            interrupts.check()
             if parts is not None and len(fresh) >= parts.interval:
                 parts.save(fresh)
                 fresh = []

@@ -9,11 +9,14 @@ A checkpoint is a dictionary of plain values and tensors, readable with `torch.l
     config     resolved configuration (plain containers)
     choices    configuration group -> word chosen
     training   all that resuming needs besides: states of optimiser and callbacks, seconds so far, best score, data's
-               fingerprint; None where only evaluation is meant
+               fingerprint, `ended` (whether training is over), `record` (what run.json would lose with the file); None
+               where only evaluation is meant
 """
 
 from __future__ import annotations
 
+import io
+import pickle
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -73,6 +76,18 @@ def save(path: Path, checkpoint: dict[str, Any], keep_previous: bool = False) ->
             if isinstance(error.__context__, OSError):
                 raise unwritable(path, error.__context__) from error
             raise
+
+
+def holds(value: object) -> bool:
+    """Whether a checkpoint gives a value back: plain values, containers of them, and tensors."""
+    content = io.BytesIO()
+    try:
+        torch.save(value, content)
+        content.seek(0)
+        torch.load(content, weights_only=True)
+    except (pickle.PicklingError, pickle.UnpicklingError, AttributeError, TypeError, RuntimeError):
+        return False
+    return True
 
 
 def previous(path: Path) -> Path:

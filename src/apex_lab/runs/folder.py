@@ -1,7 +1,7 @@
 """Run folders: named by what was run, one record each, found again by the same command.
 
     outputs/<model>[_<ablation>]_<data>_<scale>_<hash>/seed_<n>/
-        run.json        status (running | finished | failed), reason, versions, hardware, ...
+        run.json        status (running | paused | finished | failed), reason, versions, hardware, ...
         config.yaml     resolved configuration
         metrics.json    results;  curves.csv  values during training;  log.txt  messages
         checkpoints/    last.ckpt, previous.ckpt, best.ckpt
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 import socket
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,9 +24,11 @@ from typing import Any, Literal
 import torch
 import yaml
 from filelock import FileLock, Timeout
+from pydantic import BaseModel, ConfigDict, ValidationError
 
+from apex_lab.base import console
 from apex_lab.base.errors import Busy, UserError
-from apex_lab.base.files import drafts, make_folder, read_json, write_json, write_text
+from apex_lab.base.files import drafts, make_folder, read_json, set_aside, write_json, write_text
 from apex_lab.config.schema import Job
 from apex_lab.config.upgrades import FORMAT, fingerprint, upgraded
 from apex_lab.runs import provenance
@@ -42,9 +45,9 @@ def run_folder(job: Job) -> Path:
     outputs, seed = Path(job.config.paths.outputs), f"seed_{job.config.seed}"
     named = outputs / group_name(job) / seed
     if not named.exists():
-        for older in sorted(outputs.glob(f"{_words(job)}_*/{seed}/{RECORD}")):
-            if _same_run(older.parent, job):
-                return older.parent
+        for older in sorted(outputs.glob(f"{_words(job)}_*/{seed}")):
+            if _same_run(older, job):
+                return older
     return named
 
 
@@ -55,21 +58,52 @@ def _words(job: Job) -> str:
 
 def _same_run(folder: Path, job: Job) -> bool:
     """Whether a folder that an older version of apex_lab named holds this job's run."""
+    wanted = fingerprint(job.raw)
     try:
         record = read_json(folder / RECORD)
         format = record.get("format", 1)
         if format == FORMAT:  # begun by an older version, resumed by this one
-            return record.get("fingerprint") == fingerprint(job.raw)
-        if not isinstance(format, int) or not 1 <= format < FORMAT:
-            return False
+            return record.get("fingerprint") == wanted
+        formats = [format] if isinstance(format, int) and 1 <= format < FORMAT else []
+    except UserError:
+        formats = [*range(1, FORMAT + 1)]  # lost or damaged; the configuration still tells
+    return any(_stored_fingerprint(folder, format) == wanted for format in formats)
+
+
+def _stored_fingerprint(folder: Path, format: int) -> str | None:
+    """The identity of a folder's configuration, read as one of a given format; None where it is not."""
+    try:
         stored = yaml.safe_load((folder / "config.yaml").read_text())
-        return fingerprint(upgraded(stored, format)) == fingerprint(job.raw)
-    except (UserError, OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, UnicodeDecodeError):
-        return False  # damaged, so it cannot be recognised
+        return fingerprint(upgraded(stored, format))
+    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError):
+        return None
 
 
-Outcome = Literal["finished", "failed", "interrupted", "diverged"]
-"""How a run's last attempt ended; null in the record while it is running."""
+Outcome = Literal["finished", "paused", "failed", "interrupted", "diverged"]
+"""How a run's last attempt ended; null in the record while it is running. Paused: `trainer.max_minutes` were over."""
+
+KEPT = ("foreground_share", "history", "wandb_id")
+"""Entries of the record that the checkpoint keeps too: what nothing else could bring back if run.json were lost."""
+
+
+class _Start(BaseModel):
+    """An entry of the record's history."""
+
+    started: str
+
+
+class _Record(BaseModel):
+    """What must hold of a record for a run to go on with it."""
+
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+    status: str | None = None
+    seconds: float = 0.0
+    steps: int = 0
+    history: list[_Start] = []
+    data_fingerprint: str | None = None
+    foreground_share: float | None = None
+    wandb_id: str | None = None
 
 
 @dataclass
@@ -91,6 +125,7 @@ class Run:
         self.folder = run_folder(job)
         self._lock = FileLock(str(self.folder / LOCK))
         self.record = {}
+        self._lost = False
 
     def __enter__(self) -> Run:
         """Takes the run for this process and reads its record.
@@ -108,8 +143,21 @@ class Run:
                 f"{self.folder} cannot be written ({error.strerror}): choose another paths.outputs."
             ) from error
         if self.record_file.is_file():
-            self.record = read_json(self.record_file)
+            self._read()
         return self
+
+    def _read(self) -> None:
+        """Reads the record; a damaged one is set aside, since the checkpoint has what it held."""
+        try:
+            record = read_json(self.record_file)
+            _Record.model_validate(record)
+            self.record = record
+        except (UserError, ValidationError):
+            aside = set_aside(self.record_file)
+            console.warn(
+                f"{self.record_file} is damaged and was set aside as {aside.name}: "
+                "what it held is taken from the checkpoint."
+            )
 
     def __exit__(self, *_: object) -> None:
         self._lock.release()
@@ -140,8 +188,16 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Whether everything was done and its results are there."""
-        return self.record.get("status") == "finished" and self.metrics_file.is_file()
+        """Whether everything was done and its results are there and whole."""
+        if self.record.get("status") != "finished" or not self.metrics_file.is_file():
+            return False
+        try:
+            splits = read_json(self.metrics_file).get("splits")
+        except UserError:
+            return False
+        if not isinstance(splits, dict) or self.job.config.evaluation.split not in splits:
+            return False
+        return all(isinstance(scored, dict) and isinstance(scored.get("total"), dict) for scored in splits.values())
 
     def start(self, command: str, device: torch.device) -> None:
         """Records that work begins or resumes, and with what."""
@@ -149,6 +205,7 @@ class Run:
         for place in (self.folder, *self._places()):
             for part in drafts(place):
                 part.unlink()  # left by a kill in the middle of writing
+        self._lost = not self.record
         commit, dirty = provenance.commit()
         now, choices, config = _now(), self.job.choices, self.job.config
         history = [*self.record.get("history", []), {"started": now, "command": command, "commit": commit}]
@@ -185,6 +242,35 @@ class Run:
         view = [path for path in self.view_folder.rglob("*") if path.is_dir()]
         return [self.folder / "checkpoints", self.view_folder, *view]
 
+    def kept(self) -> dict[str, Any]:
+        """What a checkpoint keeps of the record."""
+        return {name: self.record[name] for name in KEPT if self.record.get(name) is not None}
+
+    def restore(self, step: int, training: Mapping[str, Any] | None) -> None:
+        """Takes back what a checkpoint knows and the record, if run.json was lost, does not.
+
+        Args:
+            step: of the checkpoint.
+            training: its entry `training`.
+        """
+        training = training or {}
+        kept = {**training.get("record", {}), "data_fingerprint": training.get("data_fingerprint")}
+        before = kept.pop("history", [])
+        if self._lost:
+            self.record["history"] = [*before, *self.record["history"]]
+            self.record["started"] = self.record["history"][0]["started"]
+        if "foreground_share" not in kept:  # of an older version
+            kept["foreground_share"] = self._share_of_results()
+        self.record.update({name: value for name, value in kept.items() if self.record.get(name) is None})
+        seconds = training.get("seconds", self.record["seconds"])
+        self.update(steps=step, seconds=round(seconds, 1))
+
+    def _share_of_results(self) -> float | None:
+        try:
+            return read_json(self.metrics_file).get("validation_foreground_share")
+        except UserError:
+            return None
+
     def update(self, **entries: Any) -> None:
         """Changes entries of the record."""
         self.record.update(entries)
@@ -197,6 +283,10 @@ class Run:
     def finish(self) -> None:
         """Records that everything is done."""
         self.update(status="finished", outcome="finished", reason=None, finished=_now())
+
+    def pause(self, reason: str) -> None:
+        """Records that time was up; the same command resumes from the last checkpoint."""
+        self.update(status="paused", outcome="paused", reason=reason, finished=_now())
 
     def fail(self, reason: str, outcome: Outcome = "failed") -> None:
         """Records why work ended early; the same command resumes from the last checkpoint."""

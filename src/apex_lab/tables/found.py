@@ -35,7 +35,7 @@ class Record(BaseModel):
 
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
 
-    status: Literal["running", "finished", "failed"]
+    status: Literal["running", "paused", "finished", "failed"]
     model: str | None
     ablation: str | None = None
     data: str | None

@@ -1,4 +1,4 @@
-"""Callbacks of training: checkpoints and the display of progress."""
+"""Callbacks of training: checkpoints, stopping, and the display of progress."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 import lightning as L
+import torch
+import torch.distributed as dist
 from pydantic import Field
 
-from apex_lab.base import console
-from apex_lab.base.interrupts import Deferred
+from apex_lab.base import console, interrupts
+from apex_lab.base.errors import UserError
 from apex_lab.base.progress import Meter
 from apex_lab.runs import checkpoints
 from apex_lab.runs.folder import Run
@@ -21,7 +23,8 @@ from apex_lab.training.learner import Learner
 class Checkpoints(L.Callback):
     """Keeps last.ckpt (to resume from), the one before it, and best.ckpt (highest or lowest validation score).
 
-    A step at which validation is due is stored after validation, so that resuming from it repeats or misses none.
+    A step at which validation is due is stored after validation, so that resuming from it repeats or misses none. It
+    must be the last callback, so that it stores what the others have made of a step.
 
     Args:
         run: whose folder the files lie in.
@@ -30,7 +33,6 @@ class Checkpoints(L.Callback):
         max_steps: the last step, always stored.
         monitor: name of the validation score.
         mode: which end of it is best.
-        deferred: a request to stop, acted on when the step at hand is stored.
         training: `training` entry of the checkpoint that this run resumes from.
     """
 
@@ -42,7 +44,6 @@ class Checkpoints(L.Callback):
         max_steps: int,
         monitor: str,
         mode: Literal["max", "min"],
-        deferred: Deferred,
         training: Mapping[str, Any] | None = None,
     ) -> None:
         self._run = run
@@ -51,25 +52,20 @@ class Checkpoints(L.Callback):
         self._max_steps = max_steps
         self._monitor = monitor
         self._sign = 1.0 if mode == "max" else -1.0
-        self._deferred = deferred
-        self._states: Mapping[str, Any] = training.get("callbacks", {}) if training else {}
         self._best: float | None = training["best"] if training else None
         self._seconds_before: float = training["seconds"] if training else 0.0
         self._start = time.monotonic()
+        self._stored: int | None = None
 
     def on_train_start(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         self._start = time.monotonic()
-        self._deferred.listen()  # Lightning has its own handler of SIGTERM, which ends a run without storing its step
-        for callback in _others(trainer, self):
-            if callback.state_key in self._states:
-                callback.load_state_dict(self._states[callback.state_key])
+        self._states(trainer)  # a state that cannot be stored is told before the work, not after it
 
     def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
         assert isinstance(learner, Learner)
-        asked = self._deferred.signum is not None
-        if (asked or learner.step % self._interval == 0) and not self._validation_due(learner.step):
+        stored_now = learner.stop is not None or learner.step % self._interval == 0
+        if stored_now and not self._validation_due(trainer, learner.step):
             self._save_last(trainer, learner)
-            self._deferred.act()
 
     def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
@@ -81,16 +77,16 @@ class Checkpoints(L.Callback):
         share = trainer.callback_metrics.get("val/foreground_share")
         self._run.update(foreground_share=None if share is None else float(share))
         self._save_last(trainer, learner)
-        self._deferred.act()
 
     def on_train_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
-        if not self._validation_due(learner.step):
+        if self._stored != learner.step:
             self._save_last(trainer, learner)
 
-    def _validation_due(self, step: int) -> bool:
+    def _validation_due(self, trainer: L.Trainer, step: int) -> bool:
         interval = self._validation_interval
-        return interval is not None and (step % interval == 0 or step == self._max_steps)
+        # Lightning validates once more where a callback ends training
+        return interval is not None and (step % interval == 0 or _ended(trainer, step, self._max_steps))
 
     def _content(self, learner: Learner) -> dict[str, Any]:
         job = self._run.job
@@ -106,13 +102,80 @@ class Checkpoints(L.Callback):
         seconds = self._seconds_before + time.monotonic() - self._start
         training = {
             "optimizer": learner.raw_optimizer().state_dict(),
-            "callbacks": {c.state_key: state for c in _others(trainer, self) if (state := c.state_dict())},
+            "callbacks": self._states(trainer),
             "best": self._best,
             "seconds": seconds,
             "data_fingerprint": self._run.record["data_fingerprint"],
+            "ended": _ended(trainer, learner.step, self._max_steps),
+            "record": self._run.kept(),
         }
         checkpoints.save(self._run.last, {**self._content(learner), "training": training}, keep_previous=True)
+        self._stored = learner.step
         self._run.beat(steps=learner.step, seconds=round(seconds, 1))
+
+    def _states(self, trainer: L.Trainer) -> dict[str, Any]:
+        """The other callbacks' states, by Lightning's name for each.
+
+        Raises:
+            UserError: a state that a checkpoint cannot hold.
+        """
+        states = {}
+        for callback in _others(trainer, self):
+            state = callback.state_dict()
+            if state and not checkpoints.holds(state):
+                raise UserError(
+                    f"The state of {callback.state_key} cannot be stored: let its state_dict() give plain values and "
+                    "tensors alone, which a checkpoint can hold without running code."
+                )
+            if state:
+                states[callback.state_key] = state
+        return states
+
+
+class Lockstep(L.Callback):
+    """What every rank does alike: takes back the states of callbacks, and agrees on the step to stop at.
+
+    A request to stop that reaches any rank, and rank 0's clock, stop all ranks after the same step, and after the
+    validation that is due there. It stands behind the callbacks whose states it gives back.
+
+    Args:
+        states: of callbacks, by Lightning's name for each.
+        max_steps: the last step; no time is up there.
+        deadline: when time is up, by `time.monotonic`; None for never.
+    """
+
+    def __init__(self, states: Mapping[str, Any], max_steps: int, deadline: float | None = None) -> None:
+        self._states, self._max_steps, self._deadline = states, max_steps, deadline
+
+    def setup(self, trainer: L.Trainer, learner: L.LightningModule, stage: str) -> None:
+        for callback in _others(trainer, self):
+            if callback.state_key in self._states:
+                callback.load_state_dict(self._states[callback.state_key])
+
+    def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
+        self._agree(trainer, learner)
+
+    def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
+        self._agree(trainer, learner)
+
+    def _agree(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
+        assert isinstance(learner, Learner)
+        if learner.stop is not None:
+            return
+        signum = interrupts.asked()
+        time_up = self._deadline is not None and time.monotonic() >= self._deadline
+        time_up = time_up and not _ended(trainer, learner.step, self._max_steps)
+        own = int(time_up) if signum is None else 1 + signum  # 0: go on
+        if trainer.world_size > 1:
+            shared = torch.tensor(own, device=learner.device)
+            dist.all_reduce(shared, op=dist.ReduceOp.MAX)
+            own = int(shared)
+        learner.stop = own - 1 if own else None
+
+
+def _ended(trainer: L.Trainer, step: int, max_steps: int) -> bool:
+    """Whether training is over: all steps are made, or a callback has ended it."""
+    return step >= max_steps or trainer.should_stop
 
 
 class LastValidation(L.Callback):
@@ -149,13 +212,16 @@ class Progress(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
+        if not trainer.is_global_zero:
+            return  # every rank has the callbacks, one of them speaks
         self._first_step = learner.step
         self._meter = Meter("step", trainer.max_steps, learner.step, self._seconds)
         self._meter.__enter__()
 
     def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
         assert isinstance(learner, Learner)
-        assert self._meter is not None
+        if self._meter is None:
+            return
         if learner.step == self._first_step + 1:
             self._meter.restart(learner.step)  # the first step also pays for what is set up once
         elif self._meter.due():
@@ -163,6 +229,8 @@ class Progress(L.Callback):
 
     def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
+        if self._meter is None:
+            return
         names = {"val/ari_fg": "ARI-FG", "val/msc_fg": "MSC-FG", "val/ari": "ARI", "val/msc": "MSC"}
         metrics = trainer.callback_metrics
         scores = ", ".join(f"{short} {float(metrics[name]):.3f}" for name, short in names.items() if name in metrics)

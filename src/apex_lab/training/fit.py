@@ -13,6 +13,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.strategies import DDPStrategy
 
+from apex_lab.base.interrupts import Interrupted
 from apex_lab.config.schema import (
     Config,
     build_clip_frames,
@@ -23,7 +24,7 @@ from apex_lab.config.schema import (
 )
 from apex_lab.data import VideoSource, training_loader, whole_loader
 from apex_lab.scene import SceneModel
-from apex_lab.training.callbacks import LastValidation
+from apex_lab.training.callbacks import LastValidation, Lockstep
 from apex_lab.training.learner import Learner
 from apex_lab.training.ranks import Ranks
 from apex_lab.training.update import Mode, WeightUpdate
@@ -38,10 +39,12 @@ def fit(
     training: Mapping[str, Any] | None,
     ranks: Ranks,
     callbacks: Sequence[L.Callback] = (),
+    keep: L.Callback | None = None,
     loggers: Sequence[Logger] = (),
     folder: Path | None = None,
-) -> None:
-    """Trains from a step to the end.
+    deadline: float | None = None,
+) -> bool:
+    """Trains from a step to the end, unless it is asked to stop or time is up.
 
     Args:
         config: of the run.
@@ -51,8 +54,16 @@ def fit(
         step: weight updates made.
         training: `training` entry of the checkpoint of that step; None at the start.
         ranks: which process this is.
-        callbacks, loggers: of rank 0.
-        folder: where Lightning may leave files; the run's.
+        callbacks: of the configuration, the same on every rank.
+        keep, loggers: what stores, of rank 0.
+        folder: where callbacks may leave files; the run's.
+        deadline: when time is up, by `time.monotonic`, on rank 0; None for never.
+
+    Returns:
+        Whether training came to its end.
+
+    Raises:
+        Interrupted: a process of this training was asked to stop; the step is stored.
     """
     settings = config.trainer
 
@@ -81,7 +92,7 @@ def fit(
         strategy=DDPStrategy(find_unused_parameters=_some_unused(config, update)) if ranks.world > 1 else "auto",
         # Lightning's own precision: validation runs in it too; the step opens the same for itself
         precision="bf16-mixed" if settings.precision == "bf16-mixed" else "32-true",
-        # nothing but the project's own files decides where a run resumes, also under Slurm
+        # this package starts all processes itself, or torchrun does; so no other cluster's variables count
         plugins=[LightningEnvironment()],
         max_epochs=1,
         max_steps=settings.max_steps,
@@ -91,7 +102,12 @@ def fit(
         num_sanity_val_steps=0,
         log_every_n_steps=1,
         logger=list(loggers),
-        callbacks=[*callbacks, LastValidation(settings.max_steps)],
+        callbacks=[
+            LastValidation(settings.max_steps),
+            *callbacks,
+            Lockstep(training.get("callbacks", {}) if training else {}, settings.max_steps, deadline),
+            *([keep] if keep is not None else []),
+        ],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
@@ -99,6 +115,7 @@ def fit(
         inference_mode=False,
         default_root_dir=folder,
     )
+    _ours_alone(trainer)
     resume_at(trainer, step)
     batches = training_loader(
         source,
@@ -120,6 +137,23 @@ def fit(
     trainer.fit(learner, batches, validation if settings.validation_interval is not None else None)
     if ranks.world > 1 and dist.is_initialized():
         dist.destroy_process_group()
+    if learner.stop:
+        raise Interrupted(learner.stop)
+    return learner.step >= settings.max_steps or trainer.should_stop
+
+
+def _ours_alone(trainer: L.Trainer) -> None:
+    """Leaves signals, and the choice of what a run resumes from, to this package.
+
+    Lightning takes SIGTERM for itself, and inside a Slurm job it loads an `hpc_ckpt_*.ckpt` that lies in the folder,
+    whatever its plugins are; it has no switch for either.
+    """
+    for owner, name, instead in (
+        (trainer._signal_connector, "register_signal_handlers", lambda: None),
+        (trainer._checkpoint_connector, "_select_ckpt_path", lambda *_, **__: None),
+    ):
+        assert callable(getattr(owner, name))  # else this Lightning is another one: see how it does these things
+        setattr(owner, name, instead)
 
 
 def _some_unused(config: Config, update: WeightUpdate) -> bool:
@@ -132,6 +166,7 @@ def _some_unused(config: Config, update: WeightUpdate) -> bool:
 def resume_at(trainer: L.Trainer, step: int) -> None:
     """Sets Lightning's counters of batches and updates, so that its steps and validations are those of the run."""
     loop = trainer.fit_loop.epoch_loop
+    loop._batches_that_stepped = step  # the step of what callbacks log
     batches, updates = loop.batch_progress.total, loop.manual_optimization.optim_step_progress.total
     batches.ready = batches.completed = step
     updates.ready = updates.completed = step

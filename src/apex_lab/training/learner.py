@@ -39,6 +39,10 @@ class Learner(L.LightningModule):
         optimizer: named parameters -> optimiser over them.
         log_interval: steps between two logged steps.
         rank, ranks: which process this is, of how many.
+
+    Attributes:
+        stop: why training stops before its next step (`apex_lab.training.callbacks.Lockstep` sets it): the number of a
+            signal, 0 when time is up; None to go on.
     """
 
     def __init__(
@@ -53,6 +57,7 @@ class Learner(L.LightningModule):
         self.automatic_optimization = False
         self.update = update
         self.logged_loss = math.nan
+        self.stop: int | None = None
         self._optimizer, self._log_interval = optimizer, log_interval
         self._rank, self._ranks = rank, ranks
         self._scoring = ScoringPart()
@@ -69,6 +74,10 @@ class Learner(L.LightningModule):
 
     def on_train_start(self) -> None:
         self._restart_clock()
+
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> int | None:
+        """-1 ends Lightning's loop here, without the validation that a stop inside a step would bring."""
+        return None if self.stop is None else -1
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """The model itself."""

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import netrc
 import os
+import re
 import secrets
 from argparse import Namespace
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
@@ -16,7 +19,7 @@ from lightning.pytorch.loggers import Logger
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import unwritable, write_text
+from apex_lab.base.files import set_aside, unwritable, write_text
 from apex_lab.base.validation import one_line
 from apex_lab.runs.folder import Run, group_name
 
@@ -24,9 +27,15 @@ from apex_lab.runs.folder import Run, group_name
 class Curves(Logger):
     """curves.csv: one row per logged step, one column per value, empty where a value was not logged at a step.
 
+    A damaged file is set aside as curves.damaged.csv, and its whole rows are taken over.
+
     Args:
         path: the file; rows that are there already are kept up to `step`.
         step: the step that a run resumes from; later rows belong to work that was lost and will be done again.
+
+    Attributes:
+        open_row: step and values of the last row where no later one was logged before the run was resumed. Loggers that
+            keep a step's values until the next step may have lost it by a kill.
     """
 
     def __init__(self, path: Path, step: int = 0) -> None:
@@ -34,13 +43,17 @@ class Curves(Logger):
         self.path = path
         self.rows: list[dict[str, float | int | str]] = []
         self.columns = ["step"]
+        self.open_row: tuple[int, dict[str, float]] | None = None
         if path.is_file():
-            with open(path, newline="") as file:
-                reader = csv.DictReader(file)
-                self.columns = list(reader.fieldnames or self.columns)
-                # a row cut off by a kill has missing fields (None) at its end
-                whole = [row for row in reader if None not in row.values() and row["step"].isdigit()]
-            self.rows = [dict(row) for row in whole if int(row["step"]) <= step]
+            columns, rows, damaged = _read_curves(path)
+            if damaged:
+                aside = set_aside(path)
+                console.warn(f"{path} is damaged and was set aside as {aside.name}; {len(rows)} rows of it are whole.")
+            self.columns = columns
+            self.rows = [dict(row) for row in rows if int(row["step"]) <= step]
+            if rows and len(self.rows) == len(rows):
+                values = {name: float(value) for name, value in rows[-1].items() if value and name != "step"}
+                self.open_row = int(rows[-1]["step"]), values
         self._rewrite()
 
     @property
@@ -57,12 +70,14 @@ class Curves(Logger):
             raise ValueError("log_metrics needs a step")
         new = [name for name in metrics if name not in self.columns]
         self.columns += new
-        if self.rows and int(self.rows[-1]["step"]) == step:
-            self.rows[-1].update(metrics)
+        # callbacks may log a step that is not the last one any more
+        place = next((i for i in range(len(self.rows), 0, -1) if int(self.rows[i - 1]["step"]) <= step), 0)
+        if place and int(self.rows[place - 1]["step"]) == step:
+            self.rows[place - 1].update(metrics)
             self._rewrite()
             return
-        self.rows.append({"step": step, **metrics})
-        if new:
+        self.rows.insert(place, {"step": step, **metrics})
+        if new or place < len(self.rows) - 1:
             self._rewrite()
             return
         try:
@@ -82,8 +97,47 @@ class Curves(Logger):
         write_text(self.path, text.getvalue())
 
 
+def _read_curves(path: Path) -> tuple[list[str], list[dict[str, str]], bool]:
+    """Columns, whole rows in the order of their steps, and whether anything but the last row was not whole."""
+    try:
+        with open(path, newline="", encoding="utf-8", errors="replace") as file:
+            reader = csv.DictReader(file)
+            columns = list(reader.fieldnames or [])
+            if not _is_heading(columns):
+                return ["step"], [], path.stat().st_size > 0
+            rows = list(reader)
+    except (OSError, csv.Error):
+        return ["step"], [], True
+    whole = [_is_whole(row) for row in rows]
+    # a kill may have cut off the last row
+    return columns, [row for row, sound in zip(rows, whole, strict=True) if sound], not all(whole[:-1])
+
+
+def _is_heading(columns: list[str]) -> bool:
+    return "step" in columns and len(set(columns)) == len(columns) and all(map(_NAME.fullmatch, columns))
+
+
+def _is_whole(row: dict[str | None, Any]) -> bool:
+    """Whether a row has a number or nothing in each column; `csv` puts None where fields are missing or too many."""
+    if None in row or None in row.values() or not row["step"].isdecimal():
+        return False
+    try:
+        for value in row.values():
+            float(value or 0)
+    except ValueError:
+        return False
+    return True
+
+
+_NAME = re.compile(r"[\w./ -]+", re.ASCII)
+"""Names of values, such as train/loss."""
+
 TIMEOUT = 30.0
 """Seconds that wandb's server has to answer before a run is logged offline; ten times that for the last upload."""
+
+
+FLUSH = 0.2
+"""Seconds that values wait in wandb's process before they are in an offline run's file; a kill can cost that much."""
 
 
 class Wandb(Logger):
@@ -103,6 +157,7 @@ class Wandb(Logger):
         self._run = run
         if "wandb_id" not in run.record:
             run.update(wandb_id=secrets.token_hex(4))
+        self._step = 0
         self._wandb = self._start(project, entity, mode)
 
     @property
@@ -127,10 +182,11 @@ class Wandb(Logger):
         words: dict[str, Any] = {
             "project": project,
             "entity": entity,
-            "dir": str(self._run.folder),
+            "dir": str(self._run.folder.resolve()),  # wandb's own process has a working folder of its own
             "group": group_name(job),
             "name": f"{group_name(job)}_seed_{job.config.seed}",
-            "tags": [choices[key] for key in ("model", "ablation", "scale") if key in choices],
+            "job_type": "train",
+            "tags": [choices[key] for key in ("model", "ablation", "experiment", "data", "scale") if key in choices],
             "config": job.raw,
             "id": self._run.record["wandb_id"],
             "resume": "allow",
@@ -143,6 +199,7 @@ class Wandb(Logger):
             console="off",
             disable_git=True,
             save_code=False,
+            x_transaction_log_flush_interval=FLUSH,
         )
         try:
             started = wandb.init(mode=mode, settings=settings, **words)
@@ -156,21 +213,58 @@ class Wandb(Logger):
         return started
 
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
-        """Sends values at a step of training."""
-        self._wandb.log({**metrics, "step": step})
+        """Sends values at a step of training, which is wandb's own step too, so that a resumed run goes on there."""
+        self._log(metrics, step or 0)
+
+    def _log(self, values: Mapping[str, Any], step: int) -> None:
+        self._step = max(self._step, step)  # wandb takes no step that lies before its last one
+        self._wandb.log({**values, "step": self._step}, step=self._step)
 
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
         """Nothing: the configuration is sent at the start."""
 
-    def finalize(self, status: str) -> None:
-        """Ends wandb's run if training failed; else it waits for the scores (`end`)."""
-        if status != "success":
-            self._wandb.finish(exit_code=1)
+    def results(self, split: str, scored: Mapping[str, Any], pictures: Sequence[Path], step: int) -> None:
+        """Sends the final scores as summary, the scores of each video as a table, and the pictures.
 
-    def end(self, scores: dict[str, float]) -> None:
-        """Sends the final scores and ends wandb's run."""
-        self._wandb.summary.update(scores)
-        self._wandb.finish()
+        Args:
+            split: what was evaluated.
+            scored: what metrics.json holds of it.
+            pictures: their files.
+            step: weight updates made.
+        """
+        import wandb
+
+        total = {key: value for key, value in scored["total"].items() if isinstance(value, int | float)}
+        self._wandb.summary.update({f"{split}/{key}": value for key, value in total.items()})
+        columns = list(dict.fromkeys(key for row in scored["per_video"] for key in row))
+        rows: list[Any] = [[row.get(key) for key in columns] for row in scored["per_video"]]
+        shown: dict[str, Any] = {f"{split}/per_video": wandb.Table(columns=columns, data=rows)}
+        for path in pictures:
+            if path.suffix == ".png":
+                shown[f"{split}/{path.stem}"] = wandb.Image(str(path))
+            elif path.suffix == ".mp4":
+                shown[f"{split}/{path.stem}"] = wandb.Video(str(path), format="mp4")
+        self._log(shown, step)
+
+    def close(self, failed: bool = False) -> None:
+        """Ends wandb's run, which a later one goes on with under its id."""
+        try:
+            self._wandb.finish(exit_code=int(failed))
+        except Exception as error:  # noqa: BLE001 - its process may have got the signal that ends this one
+            console.warn(f"wandb: the end could not be sent ({one_line(error)}).")
+
+
+@contextlib.contextmanager
+def closing(loggers: list[Logger]) -> Iterator[list[Logger]]:
+    """Ends wandb's runs with the block, whatever ends it."""
+    failed = True
+    try:
+        yield loggers
+        failed = False
+    finally:
+        for logger in loggers:
+            if isinstance(logger, Wandb):
+                logger.close(failed)
 
 
 def credentials() -> bool:

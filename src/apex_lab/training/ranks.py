@@ -22,8 +22,10 @@ from typing import Any
 
 import torch
 
+from apex_lab.base import interrupts
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import replacing
+from apex_lab.base.interrupts import Interrupted
 
 JOB = "APEX_LAB_JOB"
 """Environment variable of a process that rank 0 has started: the file with the job."""
@@ -39,9 +41,22 @@ class Ranks:
 
 def given() -> Ranks | None:
     """Rank and world size that torchrun, or rank 0 of this package, sets in the environment; None without them."""
-    if "RANK" in os.environ and "WORLD_SIZE" in os.environ:
-        return Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
-    return None
+    rank, world = os.environ.get("RANK", ""), os.environ.get("WORLD_SIZE", "")
+    return Ranks(int(rank), int(world)) if rank.isdecimal() and world.isdecimal() else None
+
+
+def check_given(outside: Ranks | None, devices: int, nodes: int) -> None:
+    """Compares what a launcher has started with what is asked for.
+
+    Raises:
+        UserError: they differ, so processes would wait for others that never come.
+    """
+    if outside is not None and outside.world != devices * nodes:
+        raise UserError(
+            f"The environment says that {outside.world} processes were started (WORLD_SIZE), but trainer.devices = "
+            f"{devices} and trainer.num_nodes = {nodes} ask for {devices * nodes}: set them alike, or unset RANK and "
+            "WORLD_SIZE."
+        )
 
 
 @contextlib.contextmanager
@@ -93,6 +108,9 @@ def started(job: dict[str, Any], devices: int, nodes: int, folder: Path) -> Iter
             try:
                 yield Ranks(0, devices)
             except RuntimeError as error:
+                signum = interrupts.asked()
+                if signum is not None:  # it may have reached the others too
+                    raise Interrupted(signum) from error
                 raise _death(workers) or error from error
             for worker in workers:
                 worker.wait(timeout=60)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from collections.abc import Iterable
@@ -9,7 +10,8 @@ from pathlib import Path
 
 import torch
 
-from apex_lab.base import console
+from apex_lab.base import console, interrupts
+from apex_lab.base.interrupts import Interrupted
 from apex_lab.config import components, trust
 from apex_lab.config.schema import Config, build_model
 from apex_lab.training.fit import fit
@@ -18,11 +20,12 @@ from apex_lab.training.ranks import JOB, Ranks, end_with_parent
 
 def main() -> None:
     """Entry point: `python -m apex_lab.training.worker`, with the environment of a rank."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in (*interrupts.ALWAYS, *interrupts.IF_FREE):
         signal.signal(number, signal.SIG_IGN)  # rank 0 decides when to stop
     end_with_parent()
     console.setup()
-    train_along(Path(os.environ[JOB]), Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])))
+    with contextlib.suppress(Interrupted):  # all ranks stop; rank 0 says so
+        train_along(Path(os.environ[JOB]), Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])))
 
 
 def train_along(file: Path, ranks: Ranks, known: Iterable[str] | None = None) -> None:
@@ -45,7 +48,8 @@ def train_along(file: Path, ranks: Ranks, known: Iterable[str] | None = None) ->
     model.load_state_dict(job["weights"])
     source = components.build(config.data, "data")
     source.open()
-    fit(config, model, source, torch.device(job["device"]), job["step"], job["training"], ranks)
+    callbacks = [components.build(node, f"callbacks.{name}") for name, node in config.callbacks.items()]
+    fit(config, model, source, torch.device(job["device"]), job["step"], job["training"], ranks, callbacks)
 
 
 if __name__ == "__main__":

@@ -70,7 +70,7 @@ def curve_page(path: Path, curves_csv: Path) -> None:
     Raises:
         UserError: the table is missing, damaged or holds no number, or the picture cannot be written.
     """
-    table = _read(curves_csv)
+    table = read_curves(curves_csv)
     panels = _panels(table)
     first, last = float(table.index[0]), float(table.index[-1])
     steps = (first - 0.03 * (last - first + 1), last + 0.03 * (last - first + 1))
@@ -100,8 +100,12 @@ def has_rows(curves_csv: Path) -> bool:
         return sum(1 for _, line in zip(range(2), file, strict=False) if line.strip()) == 2
 
 
-def _read(curves_csv: Path) -> pd.DataFrame:
-    """The table's numbers, indexed by step, without empty columns."""
+def read_curves(curves_csv: Path) -> pd.DataFrame:
+    """The table's numbers, indexed by step, without empty columns.
+
+    Raises:
+        UserError: the table is missing, damaged or holds no number.
+    """
     try:
         table = pd.read_csv(curves_csv)
     except FileNotFoundError:
