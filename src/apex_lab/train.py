@@ -7,6 +7,7 @@ python -m apex_lab.train +ablation=no_entropy seed=0,1,2,3 scale=cpu -m
 from __future__ import annotations
 
 import traceback
+from collections.abc import Sequence
 from typing import Any
 
 import lightning as L
@@ -33,6 +34,7 @@ from apex_lab.runs.state import beating, read_state
 from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
 from apex_lab.training import estimate, ranks, worker
+from apex_lab.training.callbacks import Pruned
 from apex_lab.training.fit import fit
 from apex_lab.training.learner import Diverged
 from apex_lab.training.loggers import Curves, Wandb
@@ -50,10 +52,16 @@ def title(job: Job) -> str:
     return f"{group_name(job)}, seed {job.config.seed}"
 
 
-def train(job: Job) -> None:
+def train(job: Job, callbacks: Sequence[L.Callback] = (), command: str | None = None) -> None:
     """Starts a run, resumes it where it stopped, or shows the scores of a finished one.
 
+    Args:
+        job: the run.
+        callbacks: further ones, on rank 0; they hear of a validation when its checkpoint is stored.
+        command: what the run's record names as its command; None: this process's own.
+
     Raises:
+        Pruned: a callback ended the run.
         UserError: the run cannot be done as asked; one sentence.
     """
     outside = ranks.given()
@@ -66,10 +74,10 @@ def train(job: Job) -> None:
             _show(run)
             return
         device = device_of(job.config.trainer.accelerator)
-        run.start(cli.command_line(), device)
+        run.start(command or cli.command_line(), device)
         with beating(run.folder), console.log_to(run.folder / "log.txt"):
             try:
-                _train(run, device)
+                _train(run, device, callbacks)
             except BaseException as error:
                 run.fail(*_reason(error))
                 console.note(traceback.format_exc())
@@ -81,12 +89,14 @@ def train(job: Job) -> None:
 def _reason(error: BaseException) -> tuple[str, Outcome]:
     if isinstance(error, Interrupted):
         return f"stopped by {error}", "interrupted"
+    if isinstance(error, Pruned):
+        return str(error), "pruned"
     if isinstance(error, UserError):
         return str(error), "diverged" if isinstance(error, Diverged) else "failed"
     return f"{type(error).__name__}: {one_line(error)}", "failed"
 
 
-def _train(run: Run, device: torch.device) -> None:
+def _train(run: Run, device: torch.device, callbacks: Sequence[L.Callback]) -> None:
     config = run.job.config
     checkpoint = _checkpoint(run)
     if checkpoint is not None:
@@ -109,7 +119,7 @@ def _train(run: Run, device: torch.device) -> None:
     loggers: list[Logger] = []
     if model.needs_training:
         loggers = _loggers(run, checkpoint["step"] if checkpoint else 0)
-        _fit(run, model, source, checkpoint, loggers, device)
+        _fit(run, model, source, checkpoint, loggers, device, callbacks)
     else:
         checkpoints.save(run.last, _untrained(run, model))
     scores = _evaluate(run, model, source, device)
@@ -130,6 +140,7 @@ def _fit(
     checkpoint: dict[str, Any] | None,
     loggers: list[Logger],
     device: torch.device,
+    further: Sequence[L.Callback],
 ) -> None:
     """All weight updates that are left."""
     config, settings = run.job.config, run.job.config.trainer
@@ -145,7 +156,7 @@ def _fit(
         "training": training,
     }
     with deferring() as deferred, ranks.started(job, settings.devices, settings.num_nodes, run.folder) as mine:
-        callbacks = _callbacks(run, training, deferred)
+        callbacks = [*_callbacks(run, training, deferred), *further]
         fit(config, model, source, device, start, training, mine, callbacks, loggers, run.folder)
 
 

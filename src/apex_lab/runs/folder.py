@@ -1,6 +1,6 @@
 """Run folders: named by what was run, one record each, found again by the same command.
 
-    outputs/<model>[_<ablation>]_<data>_<scale>_<hash>/seed_<n>/
+    outputs/<model>[_<ablation>][_tuned_<study>]_<data>_<scale>_<hash>/seed_<n>/
         run.json        status (running | finished | failed), reason, versions, hardware, ...
         config.yaml     resolved configuration
         metrics.json    results;  curves.csv  values during training;  log.txt  messages
@@ -49,8 +49,8 @@ def run_folder(job: Job) -> Path:
 
 
 def _words(job: Job) -> str:
-    words = [job.choices.get(group) for group in ("model", "ablation", "data", "scale")]
-    return "_".join(word for word in words if word)
+    named = {group: job.choices.get(group) for group in ("model", "ablation", "tuned", "data", "scale")}
+    return "_".join(f"tuned_{word}" if group == "tuned" else word for group, word in named.items() if word)
 
 
 def _same_run(folder: Path, job: Job) -> bool:
@@ -68,7 +68,7 @@ def _same_run(folder: Path, job: Job) -> bool:
         return False  # damaged, so it cannot be recognised
 
 
-Outcome = Literal["finished", "failed", "interrupted", "diverged"]
+Outcome = Literal["finished", "failed", "interrupted", "diverged", "pruned"]
 """How a run's last attempt ended; null in the record while it is running."""
 
 
@@ -96,7 +96,8 @@ class Run:
         """Takes the run for this process and reads its record.
 
         Raises:
-            UserError: another process has it, or the folder cannot be written.
+            Busy: another process has it.
+            UserError: the folder cannot be written.
         """
         make_folder(self.folder)
         try:
@@ -167,7 +168,7 @@ class Run:
             "history": history,
             "command": command,
             "overrides": list(self.job.overrides),
-            **{group: choices.get(group) for group in ("model", "ablation", "data", "scale", "experiment")},
+            **{group: choices.get(group) for group in ("model", "ablation", "data", "scale", "experiment", "tuned")},
             "seed": config.seed,
             "fingerprint": fingerprint(self.job.raw),
             "data_fingerprint": self.record.get("data_fingerprint"),

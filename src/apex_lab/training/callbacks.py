@@ -115,6 +115,10 @@ class Checkpoints(L.Callback):
         self._run.beat(steps=learner.step, seconds=round(seconds, 1))
 
 
+class Pruned(Exception):
+    """A callback ends a run that does not promise enough; its message says why. The run can be resumed."""
+
+
 class LastValidation(L.Callback):
     """Ends training at the last step in a way that makes Lightning validate once more there.
 
