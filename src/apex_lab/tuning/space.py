@@ -2,7 +2,7 @@
 
     key=interval(low,high)           a number between the two; int(interval(...)): a whole one, both ends included
     key=tag(log,interval(low,high))  even in its logarithm
-    key=range(start,stop,step)       as Python's range, stop left out; fractions too
+    key=range(start,stop,step)       the values that -m would run, stop left out; fractions too
     key=choice(a,b,c)  key=a,b,c     one of these
 """
 
@@ -69,7 +69,7 @@ class Parameter:
             return [value for value, _ in self.words]
         assert isinstance(d, (FloatDistribution, IntDistribution))
         middle = math.sqrt(d.low * d.high) if d.log else (d.low + d.high) / 2
-        if d.step is not None:
+        if d.step is not None and not d.log:
             middle = d.low + d.step * ((d.high - d.low) / d.step // 2)
         values: list[Value] = [d.low, d.high, int(middle) if isinstance(d, IntDistribution) else middle]
         return list(dict.fromkeys(values))

@@ -51,11 +51,13 @@ class Journal(JournalStorage, BaseHeartbeat):
         clock = self._alive / "now"
         clock.touch()
         now, found = clock.stat().st_mtime, []
-        for trial in self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,)):
-            try:
-                last = (self._alive / str(trial._trial_id)).stat().st_mtime
-            except FileNotFoundError:
-                continue  # it has just begun
+        for trial in self.get_all_trials(study_id, deepcopy=False):
+            file = self._alive / str(trial._trial_id)
+            if trial.state.is_finished():
+                file.unlink(missing_ok=True)
+            if trial.state != TrialState.RUNNING or not file.exists():  # none yet: it has just begun
+                continue
+            last = file.stat().st_mtime
             if now - last > GRACE * self._interval:
                 found.append(trial._trial_id)
         return found

@@ -35,7 +35,8 @@ class Study:
 
     Attributes:
         asked: the study's own keys.
-        word: what `+study=` chose; "study" where nothing was.
+        word: what `+study=` chose, else study.name, else "study"; the tuned file is called so.
+        named: whether one of the first two.
         words: fixed overrides of every trial.
         own: how the study's file sets keys that it does not vary, without what the command line replaced.
         parameters: what varies.
@@ -46,6 +47,7 @@ class Study:
 
     asked: TuneConfig
     word: str
+    named: bool
     words: tuple[str, ...]
     own: tuple[str, ...]
     parameters: tuple[Parameter, ...]
@@ -130,9 +132,11 @@ def check_study(
     _refuse(fixed, parameters)
     first = {p.key: p.samples()[0] for p in parameters}
     own = [word for word in fixed if word in asked.study.overrides]
+    word = choices.get("study", asked.study.name)
     unnamed = Study(
         asked=asked,
-        word=choices.get("study", "study"),
+        word=word or "study",
+        named=word is not None,
         words=tuple(fixed),
         own=tuple(own),
         parameters=tuple(parameters),

@@ -13,6 +13,7 @@ from optuna.trial import FrozenTrial
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_text
+from apex_lab.config.command_line import CHOICES
 from apex_lab.config.schema import conf_dir
 from apex_lab.tuning.study import Study
 
@@ -48,7 +49,7 @@ def write_tuned(study: Study, trial: FrozenTrial) -> list[Path]:
             console.warn(f"{shared} is of the study {other} and stays: remove it to get the values of this one there.")
     for path in found:
         console.say(str(path))
-    searched = "" if len(found) > 1 else f" --config-dir {study.folder / 'conf'}"
+    searched = "" if study.asked.study.conf is None and len(found) > 1 else f" --config-dir {found[-1].parent.parent}"
     console.say(f"use them: python -m apex_lab.train {_choices(study)}+tuned={study.word}{searched}")
     return found
 
@@ -65,7 +66,7 @@ def tuned_text(study: Study, trial: FrozenTrial) -> str:
         f"{STUDY_LINE}{study.name}",
         f"# Trial {trial.number} of {study.asked.study.trials}, seeds {list(study.asked.study.seeds)}: {scores} "
         "(validation videos).",
-        f"# Configuration: {_choices(study)}{' '.join(_told(study))}".rstrip(),
+        f"# Of: python -m apex_lab.train {_choices(study)}{' '.join(_further(study))}".rstrip(),
         "# Written by python -m apex_lab.tune; use it with +tuned=" + study.word,
     ]
     groups: list[Any] = []
@@ -90,9 +91,10 @@ def _set(values: dict[str, Any], path: list[str], value: Any) -> None:
     values[path[-1]] = value
 
 
-def _told(study: Study) -> list[str]:
-    """Fixed words of the command line, for the comment."""
-    return [word for word in study.words if word not in study.own and not word.startswith(("paths", "evaluation."))]
+def _further(study: Study) -> list[str]:
+    """Fixed words of the command line besides the choices, for the comment."""
+    keys = {word: word.lstrip("+~").partition("=")[0] for word in study.words if word not in study.own}
+    return [w for w, key in keys.items() if key not in CHOICES and not key.startswith(("paths", "evaluation."))]
 
 
 def _choices(study: Study) -> str:
@@ -103,12 +105,16 @@ def _choices(study: Study) -> str:
 
 
 def _shared(study: Study) -> Path | None:
-    """Where the file goes besides the study's folder: `study.conf`, else the repository's conf/ in a checkout."""
+    """Where the file goes besides the study's folder.
+
+    `study.conf`, else, for a study with a name, the repository's conf/ in a checkout; an installed package is not
+    written to.
+    """
     if study.asked.study.conf is not None:
         return Path(study.asked.study.conf) / "tuned" / f"{study.word}.yaml"
     folder = conf_dir()
     inside_package = Path(__file__).resolve().parent.parent in folder.parents
-    return None if inside_package else folder / "tuned" / f"{study.word}.yaml"
+    return None if inside_package or not study.named else folder / "tuned" / f"{study.word}.yaml"
 
 
 def _study_of(path: Path) -> str | None:

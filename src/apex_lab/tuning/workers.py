@@ -104,6 +104,8 @@ class Worker:
             f"study {self._study.name}: {self._asked.trials - self.left} of {self._asked.trials} trials done; "
             f"files in {self._study.folder}, storage: {where}"
         )
+        if self._study.several:
+            console.say("several objectives: no trial is pruned, since Optuna compares one value alone.")
         waits = False
         while self.left:
             if self._ends is not None and time.monotonic() >= self._ends:
