@@ -18,7 +18,8 @@ from optuna.trial import TrialState
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted
-from apex_lab.config.schema import Job, conf_dir, plain
+from apex_lab.config.composition import conf_dir, plain
+from apex_lab.config.schema import Job
 from apex_lab.runs.folder import Busy, run_folder
 from apex_lab.tuning import trial as one_trial
 from apex_lab.tuning import workers
@@ -252,5 +253,3 @@ def test_unreadable_storages(studies: Callable[..., Study], tmp_path: Path) -> N
     ]:
         with pytest.raises(UserError, match=message):
             Worker(studies(LR, f"study.storage='{url}'"), finish)
-
-

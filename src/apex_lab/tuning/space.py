@@ -1,9 +1,9 @@
 """Swept words of the command line, in Hydra's grammar, as what Optuna draws from.
 
-    key=interval(low,high)           a number between the two; int(interval(...)): a whole one, both ends included
-    key=tag(log,interval(low,high))  even in its logarithm
-    key=range(start,stop,step)       the values that -m would run, stop left out; fractions too
-    key=choice(a,b,c)  key=a,b,c     one of these
+key=interval(low,high)           a number between the two; int(interval(...)): a whole one, both ends included
+key=tag(log,interval(low,high))  even in its logarithm
+key=range(start,stop,step)       the values that -m would run, stop left out; fractions too
+key=choice(a,b,c)  key=a,b,c     one of these
 """
 
 from __future__ import annotations

@@ -89,7 +89,9 @@ def open_storage(url: str | None, folder: Path, interval_s: int, stale: Stale) -
         except OSError as error:
             raise unwritable(path, error) from error
         except (ValueError, KeyError, AssertionError) as error:
-            raise UserError(f"study.storage: {path} is not a journal of Optuna ({one_line(error)}): move it.") from error
+            raise UserError(
+                f"study.storage: {path} is not a journal of Optuna ({one_line(error)}): move it."
+            ) from error
     return _database(url, interval_s, stale)
 
 
@@ -127,4 +129,3 @@ def shown_url(text: str) -> str:
         return make_url(text).render_as_string(hide_password=True) if "://" in text else text
     except ArgumentError:
         return text
-

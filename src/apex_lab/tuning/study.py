@@ -16,6 +16,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from apex_lab.base.errors import UserError
 from apex_lab.config import command_line as cli
 from apex_lab.config import components
+from apex_lab.config.composition import CHOICES
 from apex_lab.config.schema import Job, build_model, check_job
 from apex_lab.config.upgrades import EXCLUDED, fingerprint
 from apex_lab.runs.folder import run_folder
@@ -183,10 +184,11 @@ def _refuse(fixed: Sequence[str], parameters: Sequence[Parameter]) -> None:
     """Words that would make a trial something else than an ordinary run with chosen values."""
     if not parameters:
         raise UserError(
-            "A study varies something: choose one with +study=..., or write 'optimizer.lr=tag(log,interval(1e-4,1e-2))'."
+            "A study varies something: choose one with +study=..., "
+            "or write 'optimizer.lr=tag(log,interval(1e-4,1e-2))'."
         )
     for p in parameters:
-        if p.key in (*cli.CHOICES, "trainer", "logger", "callbacks", "paths"):
+        if p.key in (*CHOICES, "trainer", "logger", "callbacks", "paths"):
             raise UserError(
                 f"{p.prefix}{p.key}={p.text}: a study tunes values of one model on one data set; "
                 "runs of several are a sweep of apex_lab.train, with -m."

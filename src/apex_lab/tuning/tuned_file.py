@@ -13,8 +13,7 @@ from optuna.trial import FrozenTrial
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_text
-from apex_lab.config.command_line import CHOICES
-from apex_lab.config.schema import conf_dir
+from apex_lab.config.composition import CHOICES, conf_dir
 from apex_lab.tuning.study import Study
 
 STUDY_LINE = "# Study: "
@@ -60,7 +59,9 @@ def tuned_text(study: Study, trial: FrozenTrial) -> str:
     Raises:
         UserError: a value is no plain one.
     """
-    scores = ", ".join(f"{name} {value:.6g}" for name, value in zip(study.asked.study.scores, trial.values, strict=True))
+    scores = ", ".join(
+        f"{name} {value:.6g}" for name, value in zip(study.asked.study.scores, trial.values, strict=True)
+    )
     lines = [
         "# @package _global_",
         f"{STUDY_LINE}{study.name}",

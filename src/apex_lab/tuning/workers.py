@@ -36,7 +36,8 @@ def tune(study: Study, train: Train) -> None:
         train: what makes a run.
 
     Raises:
-        UserError: the storage cannot be opened, the study there is another one, data are missing, or no trial completed.
+        UserError: the storage cannot be opened, the study there is another one, data are missing, or no trial is
+            complete in the end.
     """
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
