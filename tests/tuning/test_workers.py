@@ -133,6 +133,7 @@ def test_a_study_without_a_complete_trial_says_why(studies: Callable[..., Study]
         workers.tune(study, broken)
 
 
+@pytest.mark.slow
 def test_lost_trials_are_taken_over(studies: Callable[..., Study], monkeypatch: pytest.MonkeyPatch) -> None:
     """One whose heartbeats stopped, and one whose worker died before its first."""
     study = studies(LR, "study.trials=3")

@@ -36,7 +36,7 @@ class Study:
 
     Attributes:
         asked: the study's own keys.
-        word: what `+study=` chose, else study.name, else "study"; the tuned file is called so.
+        word: study.name, else what `+study=` chose, else "study"; the tuned file is called so.
         named: whether one of the first two.
         words: fixed overrides of every trial.
         own: how the study's file sets keys that it does not vary, without what the command line replaced.
@@ -133,7 +133,7 @@ def check_study(
     _refuse(fixed, parameters)
     first = {p.key: p.samples()[0] for p in parameters}
     own = [word for word in fixed if word in asked.study.overrides]
-    word = choices.get("study", asked.study.name)
+    word = asked.study.name or choices.get("study")
     unnamed = Study(
         asked=asked,
         word=word or "study",
