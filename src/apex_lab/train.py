@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ from apex_lab.runs.state import beating, read_state
 from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
 from apex_lab.training import estimate, ranks, worker
+from apex_lab.training.callbacks import Pruned
 from apex_lab.training.fit import fit
 from apex_lab.training.learner import Diverged
 from apex_lab.training.loggers import Curves, Wandb, closing
@@ -52,13 +54,19 @@ def title(job: Job) -> str:
     return f"{group_name(job)}, seed {job.config.seed}"
 
 
-def train(job: Job) -> Outcome:
+def train(job: Job, callbacks: Sequence[L.Callback] = (), command: str | None = None) -> Outcome:
     """Starts a run, resumes it where it stopped, or shows the scores of a finished one.
+
+    Args:
+        job: the run.
+        callbacks: further ones, on rank 0.
+        command: what the run's record names as its command; None: this process's own.
 
     Returns:
         "finished", or "paused" when `trainer.max_minutes` were over before training was.
 
     Raises:
+        Pruned: a callback ended the run.
         UserError: the run cannot be done as asked; one sentence.
         Interrupted: the process was asked to stop. What is stored stays, and a run that came to its end is recorded as
             finished before that.
@@ -77,10 +85,10 @@ def train(job: Job) -> Outcome:
             _show(run)
             return "finished"
         device = device_of(job.config.trainer.accelerator)
-        run.start(cli.command_line(), device)
+        run.start(command or cli.command_line(), device)
         with beating(run.folder), console.log_to(run.folder / "log.txt"):
             try:
-                outcome = _train(run, device, began)
+                outcome = _train(run, device, began, callbacks)
             except BaseException as error:
                 stop = _stop(error)
                 run.fail(*_reason(stop or error))
@@ -113,12 +121,14 @@ def _named(job: Job) -> list[str]:
 def _reason(error: BaseException) -> tuple[str, Outcome]:
     if isinstance(error, Interrupted):
         return f"stopped by {error}", "interrupted"
+    if isinstance(error, Pruned):
+        return str(error), "pruned"
     if isinstance(error, UserError):
         return str(error), "diverged" if isinstance(error, Diverged) else "failed"
     return f"{type(error).__name__}: {one_line(error)}", "failed"
 
 
-def _train(run: Run, device: torch.device, began: float) -> Outcome:
+def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Callback]) -> Outcome:
     config = run.job.config
     checkpoint = _checkpoint(run)
     if checkpoint is not None:
@@ -143,7 +153,7 @@ def _train(run: Run, device: torch.device, began: float) -> Outcome:
     with closing(_loggers(run, model, checkpoint["step"] if checkpoint else 0)) as loggers:
         if not model.needs_training:
             checkpoints.save(run.last, _untrained(run, model))
-        elif not _fit(run, model, source, checkpoint, loggers, device, began):
+        elif not _fit(run, model, source, checkpoint, loggers, device, began, further):
             return "paused"
         scored, pictures = _evaluate(run, model, source, device)
         for logger in loggers:
@@ -165,6 +175,7 @@ def _fit(
     loggers: list[Logger],
     device: torch.device,
     began: float,
+    further: Sequence[L.Callback],
 ) -> bool:
     """The weight updates that are left, or those that `trainer.max_minutes` allow; whether training came to its end."""
     config, settings = run.job.config, run.job.config.trainer
@@ -181,7 +192,7 @@ def _fit(
         "training": training,
     }
     with deferring(), ranks.started(job, settings.devices, settings.num_nodes, run.folder) as mine:
-        callbacks, keep = _callbacks(run), _checkpoints(run, training)
+        callbacks, keep = [*_callbacks(run), *further], _checkpoints(run, training)
         return fit(config, model, source, device, start, training, mine, callbacks, keep, loggers, run.folder, deadline)
 
 

@@ -27,6 +27,7 @@ def test_other_models_ablations_scales_data_and_experiments_are_no_candidates(tm
     run_folder(tmp_path, "apex", 0, ablation="gaussian")
     run_folder(tmp_path, "apex_two", 0)
     run_folder(tmp_path, "apex", 0, hash8="11111111", experiment="overfit")
+    run_folder(tmp_path, "apex", 0, hash8="22222222", tuned="sigma")
     assert chosen(tmp_path) == Choice(None)
     assert chosen(tmp_path, ablation="gaussian").group is not None
 

@@ -24,6 +24,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base import console, interrupts
 from apex_lab.base.errors import Busy, UserError
@@ -39,6 +40,7 @@ from apex_lab.config.composition import (
     full_names,
     not_there,
     plain,
+    told,
 )
 from apex_lab.config.job_list import expand
 from apex_lab.config.sweeps import Item, JobBusy, JobFailed, Known, Sweep
@@ -141,11 +143,7 @@ def _preflight(command: Command) -> list[Item]:
         raise UserError("-m cannot stand beside --cfg or --info: leave it out to see one job's configuration.")
     if arguments.help or arguments.hydra_help or arguments.info or arguments.shell_completion or arguments.cfg:
         return []
-    extra = []
-    if arguments.config_dir is not None:
-        if not Path(arguments.config_dir).is_dir():
-            raise UserError(f"--config-dir {arguments.config_dir} is not a folder.")
-        extra = [f"hydra.searchpath=[file://{Path(arguments.config_dir).resolve()}]"]
+    extra = _search_path(arguments.config_dir)
     name = arguments.config_name or command.config_name
     overrides = arguments.overrides
     with composing(overrides, arguments.config_path):
@@ -160,6 +158,58 @@ def _preflight(command: Command) -> list[Item]:
         return _checked(command, name, extra, jobs)
 
 
+def job_of(name: str, words: Sequence[str], check: Check) -> Any:
+    """Composes another command's configuration and checks it; to be called while an entry point runs.
+
+    A folder given as `--config-dir` is searched too.
+
+    Args:
+        name: file in conf/ without its ending.
+        words: overrides.
+        check: turns a composed configuration into a job.
+
+    Raises:
+        UserError: what Hydra or the check refuses, in one sentence.
+    """
+    extra = _search_path(get_args_parser().parse_args().config_dir)
+    try:
+        (made,) = _composed(check, name, extra, [tuple(words)])
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(told(error, words)) from error
+    return check(made.raw, made.choices, made.words)
+
+
+def take_words(wanted: Callable[[str], bool]) -> tuple[list[str], str | None]:
+    """Takes overrides out of this process's command line, before `launch` sees it.
+
+    Args:
+        wanted: key of an override, without + and ~ -> whether it is to be taken.
+
+    Returns:
+        The overrides, with the full names of groups, and the folder given as `--config-dir`.
+
+    Raises:
+        UserError: `-m` is among the options.
+    """
+    sys.argv[1:] = full_names(_options_last(sys.argv[1:]))
+    arguments = get_args_parser().parse_args()
+    if arguments.multirun:
+        raise UserError("-m starts many runs, and this command starts its own: leave it out.")
+    taken = [word for word in arguments.overrides if wanted(word.lstrip("+~").partition("=")[0])]
+    for word in taken:
+        sys.argv.remove(word)
+    return taken, arguments.config_dir
+
+
+def _search_path(config_dir: str | None) -> list[str]:
+    """The override that makes Hydra look into the folder given as `--config-dir`."""
+    if config_dir is None:
+        return []
+    if not Path(config_dir).is_dir():
+        raise UserError(f"--config-dir {config_dir} is not a folder.")
+    return [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"]
+
+
 def _swept_by_files(name: str, extra: Sequence[str], overrides: Sequence[str]) -> list[str]:
     """What configuration files sweep by `hydra.sweeper.params`, as words of a command line."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
@@ -172,7 +222,7 @@ def _checked(command: Command, name: str, extra: Sequence[str], jobs: Sequence[t
     """Composes and checks jobs; one that only differs in its seed from another is not built again."""
     first: dict[tuple[str, ...], Any] = {}
     items = []
-    for made in _composed(command, name, extra, jobs):
+    for made in _composed(command.check, name, extra, jobs):
         rest = tuple(word for word in made.words if not word.startswith("seed="))
         if command.reseeded is None or rest not in first:
             first[rest] = command.check(made.raw, made.choices, made.words)
@@ -183,7 +233,7 @@ def _checked(command: Command, name: str, extra: Sequence[str], jobs: Sequence[t
     return items
 
 
-def _composed(command: Command, name: str, extra: Sequence[str], jobs: Sequence[tuple[str, ...]]) -> Iterator[Composed]:
+def _composed(check: Check, name: str, extra: Sequence[str], jobs: Sequence[tuple[str, ...]]) -> Iterator[Composed]:
     """Composes jobs; the sentence on a key that no file sets says whether it exists and what is close to it."""
     try:
         yield from composed(name, jobs, extra)
@@ -195,7 +245,7 @@ def _composed(command: Command, name: str, extra: Sequence[str], jobs: Sequence[
         # Hydra only knows that no file sets the key; the check knows whether it exists
         added = [f"++{word}" if word.startswith(f"{key}=") else word for word in job]
         for made in composed(name, [added], extra):
-            command.check(made.raw, made.choices, made.words)
+            check(made.raw, made.choices, made.words)
         word = next(word for word in job if word.startswith(f"{key}="))
         raise UserError(f"{key} is set by no file that was chosen: write ++{word} to add it.") from error
 

@@ -179,6 +179,8 @@ def told(error: Exception, overrides: Sequence[str]) -> str:
     given = {word.split("=", 1)[0].lstrip("+~"): word.lstrip("+~") for word in overrides}
     if isinstance(error, MissingConfigException) and error.options is not None:
         group, _, word = str(error.missing_cfg_file).rpartition("/")
+        if group == "tuned" and not error.options:
+            return f"tuned={word}: no study has written its values here; docs/tuning.md says how one does."
         guess = did_you_mean(word, error.options)
         return sentence(f"{group}={word}: there is no such choice in {', '.join(error.options)}{guess}")
     several = re.match(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)

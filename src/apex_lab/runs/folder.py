@@ -1,6 +1,6 @@
 """Run folders: named by what was run, one record each, found again by the same command.
 
-    outputs/<model>[_<ablation>]_<data>_<scale>_<hash>/seed_<n>/
+    outputs/<model>[_<ablation>][_tuned_<study>]_<data>_<scale>_<hash>/seed_<n>/
         run.json        status (running | paused | finished | failed), reason, versions, hardware, ...
         config.yaml     resolved configuration
         metrics.json    results;  curves.csv  values during training;  log.txt  messages
@@ -52,8 +52,8 @@ def run_folder(job: Job) -> Path:
 
 
 def _words(job: Job) -> str:
-    words = [job.choices.get(group) for group in ("model", "ablation", "data", "scale")]
-    return "_".join(word for word in words if word)
+    named = {group: job.choices.get(group) for group in ("model", "ablation", "tuned", "data", "scale")}
+    return "_".join(f"tuned_{word}" if group == "tuned" else word for group, word in named.items() if word)
 
 
 def _same_run(folder: Path, job: Job) -> bool:
@@ -79,7 +79,7 @@ def _stored_fingerprint(folder: Path, format: int) -> str | None:
         return None
 
 
-Outcome = Literal["finished", "paused", "failed", "interrupted", "diverged"]
+Outcome = Literal["finished", "paused", "failed", "interrupted", "diverged", "pruned"]
 """How a run's last attempt ended; null in the record while it is running. Paused: `trainer.max_minutes` were over."""
 
 KEPT = ("foreground_share", "history", "wandb_id")
@@ -131,7 +131,8 @@ class Run:
         """Takes the run for this process and reads its record.
 
         Raises:
-            UserError: another process has it, or the folder cannot be written.
+            Busy: another process has it.
+            UserError: the folder cannot be written.
         """
         make_folder(self.folder)
         try:
@@ -225,7 +226,7 @@ class Run:
             "history": history,
             "command": command,
             "overrides": list(self.job.overrides),
-            **{group: choices.get(group) for group in ("model", "ablation", "data", "scale", "experiment")},
+            **{group: choices.get(group) for group in ("model", "ablation", "data", "scale", "experiment", "tuned")},
             "seed": config.seed,
             "fingerprint": fingerprint(self.job.raw),
             "data_fingerprint": self.record.get("data_fingerprint"),

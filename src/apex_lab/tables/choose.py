@@ -97,7 +97,8 @@ def choose(
 ) -> Choice:
     """Finds the runs of a row.
 
-    Candidates are runs of the row's model and ablation on this data set and scale, without an experiment. Those of one
+    Candidates are runs of the row's model and ablation on this data set and scale, without an experiment and with the
+    recipe's own values, not tuned ones (such runs are taken where their folder is asked for). Those of one
     folder have one configuration; among several folders the first of `REASONS` that tells them apart decides. Seeds of
     the folder that saw other data, or were scored otherwise, than most of its seeds are left out.
 
@@ -113,8 +114,8 @@ def choose(
     folders: dict[str, list[SeedRun]] = {}
     for run in runs:
         fits = run.words == words and (run.record is None or _named(run) == (*row, data, scale))
-        experiment = run.record is not None and run.record.experiment is not None
-        if fits and (not experiment or run.group in asked):
+        other = run.record is not None and (run.record.experiment is not None or run.record.tuned is not None)
+        if fits and (not other or run.group in asked):
             folders.setdefault(run.group, []).append(run)
     if not folders:
         return Choice(None)

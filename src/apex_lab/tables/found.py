@@ -41,6 +41,7 @@ class Record(BaseModel):
     data: str | None
     scale: str | None
     experiment: str | None = None
+    tuned: str | None = None
     seed: int
     reason: str | None = None
     outcome: str | None = None

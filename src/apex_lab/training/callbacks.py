@@ -178,6 +178,10 @@ def _ended(trainer: L.Trainer, step: int, max_steps: int) -> bool:
     return step >= max_steps or trainer.should_stop
 
 
+class Pruned(Exception):
+    """A callback ends a run that does not promise enough; its message says why. The run can be resumed."""
+
+
 class LastValidation(L.Callback):
     """Ends training at the last step in a way that makes Lightning validate once more there.
 
