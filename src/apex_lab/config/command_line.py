@@ -118,7 +118,7 @@ def launch(command: Command) -> None:
         with interruptible():
             sweep.items = _preflight(command)
             jobs = [item.words for item in sweep.items]
-            task = _task(Origin.here(f"apex_lab.{command.config_name}", _options(), jobs), _Here(do), sweep)
+            task = _Task(Origin.here(f"apex_lab.{command.config_name}", _options(), jobs), do, sweep)
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=command.config_name)(task)()
     except UserError as error:
         console.error(str(error))
@@ -139,27 +139,28 @@ def launch(command: Command) -> None:
         sys.exit(128 + sweep.stopped)
 
 
-@dataclass(frozen=True)
-class _Here:
-    """Does a job in the process of the command. Other processes get the function that holds it without its content."""
+@dataclass
+class _Task:
+    """What Hydra calls for each job, in this process or, by a launcher, in another.
 
+    Attributes:
+        origin: the process of the command.
+        do: does a job in it.
+        sweep: all jobs of the command; `hydra_plugins.apex_lab.sweeper` runs it.
+    """
+
+    origin: Origin
     do: Callable[[DictConfig], str] | None
+    sweep: Sweep | None
+
+    def __call__(self, config: DictConfig) -> str:
+        if self.do is None:
+            return elsewhere.run(self.origin)
+        return self.do(config)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _Here, (None,)
-
-
-def _task(origin: Origin, here: _Here, sweep: Sweep) -> Callable[[DictConfig], str]:
-    """What Hydra calls for each job, in this process or, by a launcher, in another."""
-
-    def task(config: DictConfig) -> str:
-        if origin.is_here:
-            assert here.do is not None
-            return here.do(config)
-        return elsewhere.run(origin)
-
-    task.origin, task.sweep = origin, sweep  # type: ignore[attr-defined] # for hydra_plugins.apex_lab.sweeper
-    return task
+        """Other processes start the job as a command of its own, and need neither this one's objects nor its list."""
+        return _Task, (self.origin, None, None)
 
 
 def _options() -> list[str]:
@@ -247,7 +248,12 @@ def _composed(command: Command, name: str, extra: Sequence[str], jobs: Sequence[
         raise UserError(f"{key} is set by no file that was chosen: write ++{word} to add it.") from error
 
 
-_FREE = ("hydra.job.env_set.", "hydra.sweeper.params.")
+_FREE = (
+    "hydra.job.env_set.",
+    "hydra.sweeper.params.",
+    "hydra.launcher.ray.",
+    "hydra.launcher.additional_parameters.",  # submitit's, for Slurm
+)
 """Keys of Hydra's own configuration whose names its user chooses."""
 
 

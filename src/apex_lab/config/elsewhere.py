@@ -75,11 +75,6 @@ class Origin:
         stop = f".stop_{host}_{pid}_{time.time_ns()}"
         return cls(host, pid, os.getcwd(), module, tuple(options), common, stop, path)
 
-    @property
-    def is_here(self) -> bool:
-        """Whether this is the process."""
-        return self.pid == os.getpid() and self.host == socket.gethostname()
-
     def stop_file(self, sweep_folder: str) -> Path:
         """The file of `stop`."""
         return Path(self.folder, sweep_folder, self.stop)
@@ -219,6 +214,8 @@ def _outcome(end: Path, code: int, passed: int | None) -> str:
     try:
         told: dict[str, Any] = json.loads(end.read_text(encoding="utf-8"))
     except (OSError, ValueError):  # it had no time to tell
+        if passed is not None:
+            raise JobStopped(passed) from None
         if code >= 0:
             raise JobFailed(f"its process ended with exit code {code} and no word: see its messages") from None
         memory = "; the machine may have run out of memory" if code == -signal.SIGKILL else ""
@@ -294,7 +291,7 @@ def start_ray(settings: Any) -> None:
     if not ray.is_initialized():
         if settings.get("address") is None:
             settings.setdefault("object_store_memory", 78643200)  # as the launcher does: jobs keep nothing in there
-        ray.init(**OmegaConf.to_container(settings, resolve=True))
+        ray.init(**dict(OmegaConf.to_container(settings, resolve=True)))
 
 
 @contextlib.contextmanager

@@ -132,10 +132,6 @@ class Sweep:
             for title, reason in self.failures:
                 console.error(f"  {title}: {reason}")
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """A job's process gets the function that knows this sweep; of the sweep itself it needs nothing."""
-        return Sweep, ((),)
-
     def _settled(self, index: int, first: bool = False) -> bool:
         """Takes over the outcome of a job that needs no work of this process.
 
