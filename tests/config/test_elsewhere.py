@@ -35,8 +35,8 @@ def stop(signum, frame):
     attached.tell("interrupted", signal.Signals(signum).name)
     sys.exit(128 + signum)
 
-signal.signal(signal.SIGTERM, stop)
-signal.signal(signal.SIGINT, stop)
+for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR2):
+    signal.signal(number, stop)
 attached.listen()
 word = sys.argv[1]
 print(f"pid {os.getpid()}", flush=True)

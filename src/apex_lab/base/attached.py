@@ -14,6 +14,8 @@ import signal
 import threading
 from pathlib import Path
 
+from apex_lab.base import interrupts
+
 END = "APEX_LAB_END"
 """Environment variable: the file for how the job ended."""
 
@@ -31,7 +33,8 @@ def listen() -> None:
 
 def _listen() -> None:
     number = os.read(0, 16)  # empty when the other side has died
-    os.kill(os.getpid(), int(number) if number else signal.SIGTERM)
+    if interrupts.asked() is None:  # Slurm sends its signals to all processes of a job, and a second one stops at once
+        os.kill(os.getpid(), int(number) if number else signal.SIGTERM)
 
 
 def tell(state: str, reason: str | None = None) -> None:

@@ -31,7 +31,7 @@ from typing import IO, Any
 
 from hydra.core.hydra_config import HydraConfig
 
-from apex_lab.base import attached, console, slots
+from apex_lab.base import attached, console, interrupts, slots
 from apex_lab.base.interrupts import Interrupted
 from apex_lab.config.sweeps import JobBusy, JobFailed, JobStopped
 
@@ -185,8 +185,7 @@ def _supervise(
                     break
                 if passed is None and (passed := asked()) is not None:
                     with contextlib.suppress(BrokenPipeError):  # it has just ended
-                        number = signal.SIGINT if passed == signal.SIGINT else signal.SIGTERM
-                        process.stdin.write(str(int(number)).encode())
+                        process.stdin.write(str(int(passed)).encode())
                         process.stdin.flush()
             for pump in pumps:
                 pump.join(timeout=5.0)  # a process that the job has left behind may hold the pipe
@@ -230,9 +229,7 @@ def _outcome(end: Path, code: int, passed: int | None) -> str:
     return str(told["state"])
 
 
-REQUESTS = tuple(
-    getattr(signal, n) for n in ("SIGINT", "SIGTERM", "SIGUSR1", "SIGUSR2", "SIGXCPU") if hasattr(signal, n)
-)
+REQUESTS = (*interrupts.ALWAYS, *interrupts.IF_FREE)
 """Signals that ask a worker to stop."""
 
 
