@@ -26,10 +26,11 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from apex_lab.base import console, interrupts
+from apex_lab.base import attached, console, interrupts
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.interrupts import Interrupted, interruptible
 from apex_lab.base.validation import did_you_mean, one_line, sentence
+from apex_lab.config import elsewhere
 from apex_lab.config.composition import (
     CHOICES,
     Composed,
@@ -42,6 +43,7 @@ from apex_lab.config.composition import (
     plain,
     told,
 )
+from apex_lab.config.elsewhere import Origin
 from apex_lab.config.job_list import expand
 from apex_lab.config.sweeps import Item, JobBusy, JobFailed, Known, Sweep
 
@@ -80,53 +82,99 @@ def launch(command: Command) -> None:
     its configuration is wrong; nothing was started) or 128 + n (stopped by signal n).
     """
     console.setup()
-    failed = False
+    attached.listen()
+    ended: list[tuple[str, str | None]] = []  # of the job that is no sweep's
 
-    def task(config: DictConfig) -> str:
+    def do(config: DictConfig) -> str:
         interrupts.check()
-        console.setup()  # the launcher may have put this job into a process of its own
         overrides = list(HydraConfig.get().overrides.task)
         try:
             job = command.check(plain(config), chosen(HydraConfig.get().runtime), overrides)
-            return command.work(job) or "finished"
+            state = command.work(job) or "finished"
         except Busy as error:
-            _fail(JobBusy(str(error)), str(error))
+            return end("busy", JobBusy(str(error)), str(error))
         except UserError as error:
-            _fail(JobFailed(one_line(error)), str(error))
+            return end("failed", JobFailed(one_line(error)), str(error))
         except Exception as error:  # noqa: BLE001 - reported below; the other jobs of a sweep must still run
             traceback.print_exc()
-            _fail(JobFailed(f"{type(error).__name__}: {one_line(error)}"))
-        return "failed"
+            return end("failed", JobFailed(f"{type(error).__name__}: {one_line(error)}"))
+        ended.append((state, None))
+        return state
 
-    def _fail(error: JobFailed | JobBusy, message: str | None = None) -> None:
+    def end(state: str, error: JobFailed | JobBusy, message: str | None = None) -> str:
         """Reports a failure to whoever has started the job."""
-        if message is not None and not (swept() and isinstance(error, JobBusy)):
+        swept = HydraConfig.get().mode == RunMode.MULTIRUN
+        if message is not None and not (swept and state == "busy"):
             console.error(message)
-        if swept():
+        if swept:
             raise error  # comes back through Hydra's job return
-        nonlocal failed
-        failed = True
-
-    def swept() -> bool:
-        return HydraConfig.get().mode == RunMode.MULTIRUN
+        ended.append((state, str(error)))
+        return state
 
     sys.argv[1:] = full_names(_options_last(sys.argv[1:]))
     if command.config_name == "evaluate":
         # the checkpoint brings the data's settings, so no file here has them; the check knows which exist
         sys.argv[1:] = [f"++{word}" if word.startswith("data.") else word for word in sys.argv[1:]]
+    sweep = Sweep([], command.known)
     try:
         with interruptible():
-            task.sweep = sweep = Sweep(_preflight(command), command.known)  # type: ignore[attr-defined]
+            sweep.items = _preflight(command)
+            jobs = [item.words for item in sweep.items]
+            task = _Task(Origin.here(f"apex_lab.{command.config_name}", _options(), jobs), do, sweep)
             hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=command.config_name)(task)()
     except UserError as error:
         console.error(str(error))
+        attached.tell("failed", one_line(error))
         sys.exit(CONFIG_ERROR)
     except Interrupted as stop:
+        sweep.take_stock()
+        sweep.report()
         console.error(f"Stopped by {stop}; the same command resumes from here.")
+        attached.tell("interrupted", str(stop))
         sys.exit(128 + stop.signum)
     sweep.report()
-    if failed or sweep.failures:
+    for state, reason in ended:
+        attached.tell(state, reason)
+    if sweep.failures or any(state in ("failed", "busy") for state, _ in ended):
         sys.exit(RUN_ERROR)
+    if sweep.stopped is not None:
+        sys.exit(128 + sweep.stopped)
+
+
+@dataclass
+class _Task:
+    """What Hydra calls for each job, in this process or, by a launcher, in another.
+
+    Attributes:
+        origin: the process of the command.
+        do: does a job in it.
+        sweep: all jobs of the command; `hydra_plugins.apex_lab.sweeper` runs it.
+    """
+
+    origin: Origin
+    do: Callable[[DictConfig], str] | None
+    sweep: Sweep | None
+
+    def __call__(self, config: DictConfig) -> str:
+        if self.do is None:
+            return elsewhere.run(self.origin)
+        return self.do(config)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Other processes start the job as a command of its own, and need neither this one's objects nor its list."""
+        return _Task, (self.origin, None, None)
+
+
+def _options() -> list[str]:
+    """The options of this command, besides its words, that each of its jobs needs."""
+    arguments = get_args_parser().parse_args()
+    options = []
+    for name in ("config_dir", "config_path"):
+        if (value := getattr(arguments, name)) is not None:
+            options += [f"--{name.replace('_', '-')}", str(Path(value).absolute())]
+    if arguments.config_name is not None:
+        options += ["--config-name", arguments.config_name]
+    return options
 
 
 def _preflight(command: Command) -> list[Item]:
@@ -250,7 +298,12 @@ def _composed(check: Check, name: str, extra: Sequence[str], jobs: Sequence[tupl
         raise UserError(f"{key} is set by no file that was chosen: write ++{word} to add it.") from error
 
 
-_FREE = ("hydra.job.env_set.", "hydra.sweeper.params.")
+_FREE = (
+    "hydra.job.env_set.",
+    "hydra.sweeper.params.",
+    "hydra.launcher.ray.",
+    "hydra.launcher.additional_parameters.",  # submitit's, for Slurm
+)
 """Keys of Hydra's own configuration whose names its user chooses."""
 
 

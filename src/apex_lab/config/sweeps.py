@@ -6,9 +6,11 @@ returns, so it is right under every launcher. `hydra_plugins.apex_lab.sweeper` c
 
 from __future__ import annotations
 
+import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -19,6 +21,8 @@ from apex_lab.base.validation import one_line
 
 Launch = Callable[[Sequence[Sequence[str]], int], Sequence[JobReturn]]
 """(words of each job, number of the first) -> what became of each."""
+
+Relaying = Callable[[], AbstractContextManager[None]]
 
 POLL = 2.0
 """Seconds between two looks at runs that other processes work on."""
@@ -41,6 +45,17 @@ class JobFailed(RuntimeError):
 
 class JobBusy(RuntimeError):
     """Another process is working on the job; the sentence."""
+
+
+class JobStopped(RuntimeError):
+    """A job was asked to stop and has stored what it did; the number of the signal."""
+
+    @property
+    def signum(self) -> int:
+        return int(self.args[0])
+
+    def __str__(self) -> str:
+        return f"stopped by {signal.Signals(self.signum).name}"
 
 
 @dataclass(frozen=True)
@@ -67,15 +82,28 @@ class Sweep:
         known: tells the state of a job; None where jobs leave nothing behind that could be looked at.
         retry_failed: run jobs again that failed in an earlier start.
         outcomes: index of the job -> (state, reason), filled by `run`.
+        stopped: the signal by which a job was stopped, when the sweep itself was not.
     """
 
     items: Sequence[Item]
     known: Callable[[Any], Known] | None = None
     retry_failed: bool = False
     outcomes: dict[int, tuple[str, str | None]] = field(default_factory=dict)
+    stopped: int | None = None
+    _relaying: Relaying = nullcontext
+    _again: set[int] = field(default_factory=set)
 
-    def run(self, launch: Launch) -> None:
-        """Runs what there is to run until every job has an outcome."""
+    def run(self, launch: Launch, relaying: Relaying = nullcontext) -> None:
+        """Runs what there is to run until every job has an outcome.
+
+        Args:
+            launch: does jobs.
+            relaying: a block in which a request to stop goes to the jobs, where other processes do them.
+
+        Raises:
+            Interrupted: the sweep was asked to stop.
+        """
+        self._relaying = relaying
         waiting = [index for index in range(len(self.items)) if not self._settled(index, first=True)]
         if before := Counter(state for state, _ in self.outcomes.values()):
             console.say(f"{_counted(before)} before, {len(waiting)} of {len(self.items)} jobs to run.")
@@ -122,21 +150,58 @@ class Sweep:
         return index in self.outcomes
 
     def _launch(self, indices: Sequence[int], launch: Launch) -> None:
-        try:
-            returns = launch([self.items[index].words for index in indices], indices[0])
-        except Exception as error:  # noqa: BLE001 - a launcher may raise anything when a job's process dies
-            for index in indices:
-                self._died(index, f"the launcher ended with {type(error).__name__}: {one_line(error)}")
-            return
-        for index, returned in zip(indices, returns, strict=True):
-            outcome = _outcome(returned)
-            if outcome is not None:
-                self.outcomes[index] = outcome
+        with self._relaying():
+            try:
+                returns = launch([self.items[index].words for index in indices], indices[0])
+            except Exception as error:  # noqa: BLE001 - a launcher may raise anything when a worker dies
+                self._broke(indices, f"the launcher ended with {type(error).__name__}: {one_line(error)}")
+                return
+            for index, returned in zip(indices, returns, strict=True):
+                self._take(index, returned)
 
-    def _died(self, index: int, reason: str) -> None:
-        """Settles a job whose launcher broke: it may have ended before."""
-        if not self._settled(index):
-            self.outcomes[index] = ("failed", reason)
+    def _take(self, index: int, returned: JobReturn) -> None:
+        """Takes over what a job's return says; a job that another process is working on stays without an outcome."""
+        if returned.status == JobStatus.COMPLETED:
+            value = returned.return_value
+            self.outcomes[index] = (value if isinstance(value, str) else "finished", None)
+            return
+        error = returned._return_value  # the property raises it, and prints
+        if isinstance(error, JobBusy):
+            return
+        if isinstance(error, JobStopped):
+            self.stopped = self.stopped or error.signum
+            self.outcomes[index] = ("interrupted", str(error))
+            return
+        known = isinstance(error, JobFailed)
+        self.outcomes[index] = ("failed", str(error) if known else f"{type(error).__name__}: {one_line(error)}")
+
+    def _broke(self, indices: Sequence[int], reason: str) -> None:
+        """Settles jobs whose launcher broke. Those that had not ended are launched once more, if any had begun: a
+        launcher such as joblib ends all workers when one dies.
+        """
+        states = {
+            index: self.known(self.items[index].job).state if self.known else "waiting"
+            for index in indices
+            if not self._settled(index)
+        }
+        begun = any(state != "waiting" for state in states.values())
+        for index, state in states.items():
+            if state in ("interrupted", "paused"):
+                self.outcomes[index] = (state, None)
+            elif state == "running":
+                pass  # its worker lives, or another sweep has it: it is waited for
+            elif begun and index not in self._again:
+                self._again.add(index)
+            else:
+                self.outcomes[index] = ("failed", reason)
+        if again := [index for index in states if index not in self.outcomes]:
+            console.warn(f"{reason}; {len(again)} jobs that have not ended are looked at once more.")
+
+    def take_stock(self) -> None:
+        """Fills in what became of the jobs of a sweep that was stopped."""
+        for index in range(len(self.items)):
+            if index not in self.outcomes and not self._settled(index) and self.known is not None:
+                self.outcomes[index] = (self.known(self.items[index].job).state, None)
 
     def _free(self, busy: Sequence[int]) -> list[int]:
         """Waits until some of the jobs that others work on are free; those of them that are left to run."""
@@ -153,17 +218,6 @@ class Sweep:
                     console.say(f"waiting for {self.items[index].title}, which {known[index].owner} is working on")
                     told.add(index)
         return []
-
-
-def _outcome(returned: JobReturn) -> tuple[str, str | None] | None:
-    """What a job's return says; None: another process is working on it."""
-    if returned.status == JobStatus.COMPLETED:
-        value = returned.return_value
-        return (value if isinstance(value, str) else "finished"), None
-    error = returned._return_value  # the property raises it, and prints
-    if isinstance(error, JobBusy):
-        return None
-    return "failed", str(error) if isinstance(error, JobFailed) else f"{type(error).__name__}: {one_line(error)}"
 
 
 def _counted(counts: Counter[str]) -> str:

@@ -22,11 +22,14 @@ class JobsConf:
     Attributes:
         params: key -> values, swept like words of the command line (for experiment files).
         retry_failed: run jobs again that failed in an earlier start.
+        slots: into how many equal parts, for one job each, every machine is divided; null: joblib's n_jobs, and no
+            division with other launchers.
     """
 
     _target_: str = "hydra_plugins.apex_lab.sweeper.JobSweeper"
     params: dict[str, str] | None = None
     retry_failed: bool = False
+    slots: int | None = None
 
 
 ConfigStore.instance().store(group="hydra/sweeper", name="jobs", node=JobsConf, provider="apex_lab")
@@ -35,14 +38,20 @@ ConfigStore.instance().store(group="hydra/sweeper", name="jobs", node=JobsConf, 
 class JobSweeper(Sweeper):
     """Runs the jobs that the command line was expanded to before Hydra started."""
 
-    def __init__(self, params: dict[str, str] | None = None, retry_failed: bool = False) -> None:
+    def __init__(
+        self, params: dict[str, str] | None = None, retry_failed: bool = False, slots: int | None = None
+    ) -> None:
         self._retry_failed = retry_failed
         self._task: TaskFunction | None = None
         self._launcher: Launcher | None = None
+        self._folder = ""
+        self._basic = True
 
     def setup(self, *, hydra_context: HydraContext, task_function: TaskFunction, config: DictConfig) -> None:
         """Takes what Hydra has composed; the launcher is built here, so that a faulty one fails before any work."""
         self._task = task_function
+        self._folder = str(config.hydra.sweep.dir)
+        self._basic = str(config.hydra.launcher._target_).endswith(".BasicLauncher")
         self._launcher = Plugins.instance().instantiate_launcher(
             hydra_context=hydra_context, task_function=task_function, config=config
         )
@@ -50,6 +59,10 @@ class JobSweeper(Sweeper):
     def sweep(self, arguments: list[str]) -> Any:
         """Runs all jobs; failures are collected in the sweep, and none is raised."""
         assert self._launcher is not None
-        sweep = self._task.sweep  # type: ignore[union-attr] # set by apex_lab.config.command_line.launch
+        sweep = self._task.sweep  # type: ignore[union-attr] # both set by apex_lab.config.command_line.launch
         sweep.retry_failed = self._retry_failed
-        sweep.run(self._launcher.launch)
+        if self._basic:
+            sweep.run(self._launcher.launch)
+        else:
+            relaying = self._task.origin.relaying  # type: ignore[union-attr]
+            sweep.run(self._launcher.launch, lambda: relaying(self._launcher, self._folder))
