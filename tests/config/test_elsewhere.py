@@ -105,7 +105,7 @@ def test_outcomes_come_back(run: Callable[..., str], capfd: pytest.CaptureFixtur
 
 
 def test_a_signal_to_the_worker_reaches_the_job_once(
-    run: Callable[..., str], capfd: pytest.CaptureFixture[str]
+    run: Callable[..., str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     before = signal.getsignal(signal.SIGUSR2)
     for number in (signal.SIGUSR2, signal.SIGINT):

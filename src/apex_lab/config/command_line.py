@@ -200,6 +200,7 @@ def _preflight(command: Command) -> list[Item]:
         if not (arguments.multirun or "hydra.mode=MULTIRUN" in overrides):
             _checked(command, name, extra, [tuple(overrides)])
             return []
+        _check_launcher(name, extra, overrides)
         if any(word.startswith("hydra/sweeper=") for word in overrides):
             return []  # another sweeper chooses its values as it goes; each of its jobs is checked when it starts
         jobs = expand([*_swept_by_files(name, extra, overrides), *overrides], extra)
@@ -320,6 +321,25 @@ def _check_hydra_keys(name: str, extra: Sequence[str], overrides: Sequence[str])
         siblings = OmegaConf.select(known, parent, default={})
         if last not in siblings:
             raise UserError(sentence(f"Unknown key {word.lstrip('+')}{did_you_mean(last, map(str, siblings))}"))
+
+
+def _check_launcher(name: str, extra: Sequence[str], overrides: Sequence[str]) -> None:
+    """Refuses a launcher that is not there, keys that it does not have, and what jobs cannot be launched with."""
+    ours = ("hydra/launcher", "hydra.launcher", "hydra/sweeper", "hydra.sweeper")
+    words = [word for word in overrides if word.lstrip("+~").startswith(ours)]
+    hydra_part = compose(name, overrides=[*extra, *words], return_hydra_config=True).hydra
+    for key in ("tasks_per_node", "nodes"):
+        if hydra_part.launcher.get(key, 1) != 1:
+            raise UserError(
+                f"hydra.launcher.{key}={hydra_part.launcher[key]}: a job is one task on one machine, which starts the "
+                "other processes of trainer.devices itself; for several machines use torchrun (docs/clusters.md)."
+            )
+    slots = hydra_part.sweeper.get("slots")
+    if slots is not None and slots < 1:
+        raise UserError(f"hydra.sweeper.slots={slots}: give the number of jobs that a machine does at once, or null.")
+    jobs = hydra_part.launcher.get("n_jobs")
+    if jobs == 0:
+        raise UserError("hydra.launcher.n_jobs=0: give the number of jobs at once, or -1 for one on each core.")
 
 
 def _check_groups(command: str, overrides: Sequence[str]) -> None:

@@ -27,6 +27,9 @@ from apex_lab.config import trust
 CHOICES = ("model", "ablation", "data", "scale", "experiment", "tuned")
 """Groups that name a run; a run has one choice of each."""
 
+EXTRAS = {"joblib": "launchers", "submitit_local": "launchers", "submitit_slurm": "launchers", "ray": "ray"}
+"""Launcher -> the extra of apex_lab that brings it."""
+
 SHORT = {name: f"model/apex/{name}" for name in ("likelihood", "masks", "glimpses")}
 """Short word -> group: APEX's swappable parts may be chosen by the last part of their names."""
 
@@ -179,8 +182,13 @@ def told(error: Exception, overrides: Sequence[str]) -> str:
     given = {word.split("=", 1)[0].lstrip("+~"): word.lstrip("+~") for word in overrides}
     if isinstance(error, MissingConfigException) and error.options is not None:
         group, _, word = str(error.missing_cfg_file).rpartition("/")
+<<<<<<< HEAD
         if group == "tuned" and not error.options:
             return f"tuned={word}: no study has written its values here; docs/tuning.md says how one does."
+=======
+        if group == "hydra/launcher" and word in EXTRAS:
+            return f"{group}={word} needs a package that is not installed: pip install 'apex-lab[{EXTRAS[word]}]'."
+>>>>>>> launchers
         guess = did_you_mean(word, error.options)
         return sentence(f"{group}={word}: there is no such choice in {', '.join(error.options)}{guess}")
     several = re.match(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)

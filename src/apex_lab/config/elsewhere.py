@@ -97,6 +97,8 @@ class Origin:
         if hasattr(launcher, "ray_cfg"):
             start_ray(launcher.ray_cfg.init)
             return relaying(self.stop_file(sweep_folder), ())  # Ray keeps Ctrl-C from its workers itself
+        if hasattr(launcher, "params"):  # submitit's
+            console.say(f"What jobs say stands in {sweep_folder}/.submitit.")
         return relaying(self.stop_file(sweep_folder), (signal.SIGINT, signal.SIGTERM))
 
 
@@ -282,6 +284,7 @@ def _noting() -> Iterator[_Noted]:
 
 def start_ray(settings: Any) -> None:
     """Starts Ray, or connects to it, before this process listens for requests to stop: Ray sets handlers of its own."""
+    os.environ.setdefault("RAY_DEDUP_LOGS", "0")  # else it leaves out lines that look alike
     import ray
     from omegaconf import OmegaConf
 
