@@ -31,7 +31,7 @@ BUSY_SECONDS = 5.0
 
 
 class Watch(L.Callback):
-    """Reports the first objective after every validation, and ends the run where the pruner says so.
+    """Reports the objective after every validation, and ends the run where the pruner says so.
 
     What is reported is the mean over the seeds so far: the final scores of finished seeds and the latest of this one.
     Its step is the weight updates of all seeds together, so trials are compared after equal work.
@@ -41,12 +41,11 @@ class Watch(L.Callback):
         name: the objective.
         before: final scores of the seeds before this one.
         max_steps: weight updates of a run.
-        prunes: whether the pruner is asked.
     """
 
-    def __init__(self, trial: optuna.Trial, name: str, before: list[float], max_steps: int, prunes: bool) -> None:
+    def __init__(self, trial: optuna.Trial, name: str, before: list[float], max_steps: int) -> None:
         self._trial, self._name, self._before = trial, name, before
-        self._max_steps, self._prunes = max_steps, prunes
+        self._max_steps = max_steps
 
     def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
@@ -59,7 +58,7 @@ class Watch(L.Callback):
         step = len(self._before) * self._max_steps + learner.step
         self._trial.report(mean, step)
         last = learner.step >= self._max_steps  # nothing is left to save
-        if self._prunes and not last and self._trial.should_prune():
+        if not last and self._trial.should_prune():
             raise Pruned(f"pruned at step {learner.step}: {self._name} {mean:.4g} promises less than earlier trials")
 
 
@@ -98,9 +97,10 @@ def objective(study: Study, trial: optuna.Trial, train: Train) -> tuple[float, .
         folders.append(str(trial_folder(job)))
         trial.set_user_attr("folders", folders)
         before = [score[0] for score in scores]
-        watch = Watch(trial, names[0], before, job.config.trainer.max_steps, not study.several)
+        # Optuna takes reports of studies with one objective alone
+        watch = [] if study.several else [Watch(trial, names[0], before, job.config.trainer.max_steps)]
         try:
-            _when_free(train, job, [watch], study.command(job))
+            _when_free(train, job, [*watch], study.command(job))
         except Pruned as error:
             raise optuna.TrialPruned(str(error)) from error
         scores.append(_final(job, names))
