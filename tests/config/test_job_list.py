@@ -9,7 +9,7 @@ import pytest
 
 from apex_lab.base.errors import UserError
 from apex_lab.config.composition import composed, composing
-from apex_lab.config.job_list import Words, expand
+from apex_lab.config.job_list import Words, expand, sweeps, tables_of
 
 
 @pytest.fixture
@@ -109,3 +109,14 @@ def test_seeds_share_a_composition() -> None:
     assert [one.raw["seed"] for one in made] == [0, 5, 7]
     assert [one.words for one in made] == words
     assert {key for key in made[0].raw if made[0].raw[key] != made[2].raw[key]} == {"seed"}
+
+
+@pytest.mark.usefixtures("hydra")
+def test_sweeps_name_their_tables(tmp_path: Path) -> None:
+    assert sweeps(["+sweep=paper,tracking", "seed=0"]) == ["paper", "tracking"]
+    assert sweeps(["seed=0"]) == []
+    assert tables_of(["tracking", "segmentation"]) == [1, 2]
+    assert tables_of(["paper"]) == [1, 2, 3, 4]
+    (tmp_path / "sweep").mkdir()
+    (tmp_path / "sweep" / "mine.yaml").write_text("include: [tracking]\n")
+    assert tables_of(["mine", "tracking"], [f"hydra.searchpath=[file://{tmp_path}]"]) is None

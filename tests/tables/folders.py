@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from apex_lab.config.upgrades import fingerprint
+from apex_lab.runs.listed import Listed
+from apex_lab.runs.state import read_state
 from apex_lab.tables import definition as spec
 from apex_lab.tables.asked import Tables, TablesConfig, assemble
 from apex_lab.tables.build import Built
-from apex_lab.tables.choose import Version
-from apex_lab.tables.found import collect
 from apex_lab.tables.missing_runs import Command
 from apex_lab.tables.rows import Line
 
@@ -70,38 +71,56 @@ def run_folder(
     return folder
 
 
-VERSION = Version(
-    models={"apex", "oracle", "one_segment", "color_clusters", "background_subtraction"},
-    ablations={"image_stn", "no_entropy", "scalor_norm", "gaussian", "gaussian_scalor_norm"},
-    fingerprint=lambda words: "0123abcd" * 8,
-)
-"""A version whose configurations all have the fingerprint that `run_folder` writes."""
+def job(outputs: Path, model: str, seed: int, ablation: str | None = None, **more: Any) -> Listed:
+    """A job whose run is where `run_folder` puts it; `more`: data, scale, hash8, words."""
+    data, scale = more.get("data", "p2d"), more.get("scale", "paper")
+    extra = more.get("words", ())
+    choices = {"model": model, "data": data, "scale": scale, **({"ablation": ablation} if ablation else {})}
+    words = [f"model={model}", *([f"+ablation={ablation}"] if ablation else []), f"seed={seed}"]
+    words += [*([f"data={data}"] if data != "p2d" else []), f"scale={scale}", *extra]
+    raw = {"seed": seed, "paths": {"outputs": str(outputs)}, "model": {"values": list(extra)}}
+    named = [model, *([ablation] if ablation else []), data, scale, more.get("hash8", "0123abcd")]
+    return Listed(tuple(words), raw, choices, fingerprint(raw), read_state(outputs / "_".join(named) / f"seed_{seed}"))
 
 
-def job(outputs: Path, **asked: Any) -> Tables:
-    """A checked command on p2d at paper scale; `asked` changes single keys."""
-    keys: dict[str, Any] = {
+YARDSTICKS = {row.model for section in SPECIFICATION.yardsticks for row in section.rows}
+
+
+def jobs(outputs: Path, tables: Sequence[int], seeds: Sequence[int], **more: Any) -> list[Listed]:
+    """The jobs of the rows of tables, as the shipped sweeps have them."""
+    wanted = [table for table in SPECIFICATION.tables if table.number in tables]
+    sections = [section for table in wanted for section in SPECIFICATION.sections(table, yardsticks=True)]
+    rows = dict.fromkeys(row.run for section in sections for row in section.rows)
+    return [
+        job(outputs, model, seed, ablation, **more)
+        for model, ablation in rows
+        for seed in ((0,) if model in YARDSTICKS else seeds)
+    ]
+
+
+def asked(outputs: Path, **keys: Any) -> Tables:
+    """A checked command; `keys` changes single ones of its own, `seeds`, `scale`, `data` and `jobs` what is run."""
+    own: dict[str, Any] = {
         "tables": (1,),
-        "seeds": (0, 1, 2, 3),
         "exclude_failed": ("gswm",),
-        "groups": (),
         "published": False,
         "yardsticks": False,
         "arrangement_mean": "scenario",
         "folder": None,
         "dry_run": True,
-        "paths": {"outputs": str(outputs), "data": "data"},
     }
-    return Tables(TablesConfig(**keys | asked), "p2d", "paper", SPECIFICATION, ())
+    settings = TablesConfig(**{**own, **{key: value for key, value in keys.items() if key in own}})
+    more = {key: value for key, value in keys.items() if key in ("data", "scale")}
+    listed = keys.get("jobs") or jobs(outputs, settings.tables or (1,), keys.get("seeds", (0, 1, 2, 3)), **more)
+    return Tables(settings, ("+sweep=some",), tuple(listed), settings.tables, SPECIFICATION)
 
 
-def made(
-    outputs: Path, version: Version = VERSION, scale: str = "paper", **asked: Any
-) -> tuple[list[Built], list[Command], list[str]]:
-    """Tables, commands and problems of a folder of runs."""
-    return assemble(collect(outputs), replace(job(outputs, **asked), scale=scale), version)
+def made(outputs: Path, **keys: Any) -> tuple[tuple[Built, ...], tuple[Command, ...]]:
+    """Tables and commands of a folder of runs."""
+    found = assemble(asked(outputs, **keys))
+    return found.tables, found.commands
 
 
 def line(table: Built, label: str) -> Line:
     """The row of that name."""
-    return next(line for line in table.lines if line.label == label)
+    return next(line for line in table.lines if line.name == label)

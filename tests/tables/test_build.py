@@ -12,11 +12,11 @@ import pytest
 from apex_lab.tables.build import Built
 from apex_lab.tables.markdown import table_text
 from apex_lab.tables.rows import rounded, summarise
-from tests.tables.folders import SCORES, line, made, run_folder
+from tests.tables.folders import SCORES, job, line, made, run_folder
 
 
 def only(outputs: Path, number: int = 1, **asked: object) -> Built:
-    tables, _, _ = made(outputs, tables=(number,), **asked)
+    tables, _ = made(outputs, tables=(number,), **asked)
     return tables[0]
 
 
@@ -129,7 +129,7 @@ def test_golden_tracking_with_the_paper_s_values(tmp_path: Path) -> None:
 
 def test_the_public_protocol_stands_beside(tmp_path: Path) -> None:
     run_folder(tmp_path, "apex", 0, {"mota": 10.0, "mota_start2": 20.0})
-    tables, _, _ = made(tmp_path, tables=(2,), published=True)
+    tables, _ = made(tmp_path, tables=(2,), published=True)
     assert [table.number for table in tables] == ["2", "2b"]
     cells = [line(tables[0], "APEX").cells["mota"], line(tables[1], "APEX").cells["mota_start2"]]
     assert [cell.summary.mean for cell in cells if cell.summary] == [10.0, 20.0]
@@ -276,12 +276,12 @@ def test_rows_scored_on_other_videos_do_not_compete(tmp_path: Path) -> None:
     )
 
 
-def test_more_seeds_than_asked_for_all_count(tmp_path: Path) -> None:
+def test_only_the_seeds_of_the_jobs_count(tmp_path: Path) -> None:
     for seed in (0, 1, 2, 3, 8):
-        run_folder(tmp_path, "apex", seed)
-    found = line(only(tmp_path), "APEX")
-    assert (found.seeds, found.missing) == ("5", ())
-    assert found.notes == ("mean over the seeds 0, 1, 2, 3 and 8.",)
+        run_folder(tmp_path, "apex", seed, {"ari": 0.1 * seed})
+    found = line(only(tmp_path, seeds=(0, 8)), "APEX")
+    assert (found.seeds, found.counted, found.missing) == ("2", (0, 8), ())
+    assert found.cells["ari"].summary == summarise([0.0, 0.8])
 
 
 PERFECT = dict.fromkeys(("ari_fg", "msc_fg", "ari", "msc"), 1.0) | {
@@ -357,10 +357,52 @@ def test_damaged_arrangement_is_shown(tmp_path: Path) -> None:
 def test_other_scales_are_not_mixed_in(tmp_path: Path) -> None:
     run_folder(tmp_path, "apex", 0, {"ari": 0.1})
     run_folder(tmp_path, "apex", 0, {"ari": 0.9}, scale="cpu")
-    tables, _, _ = made(tmp_path, scale="cpu", published=True)
+    tables, _ = made(tmp_path, scale="cpu", published=True)
     cell = line(tables[0], "APEX").cells["ari"]
     assert cell.summary == summarise([0.9])
+    assert "scale cpu (not the paper's scale)" in tables[0].caption
     assert "of scale paper and cannot be compared with scale cpu" in tables[0].caption
+    assert {each.label for each in tables[0].lines} >= {"APEX, scale=cpu", "OP3, scale=cpu"}
+
+
+def test_rows_say_what_differs_from_the_paper(tmp_path: Path) -> None:
+    mixed = [
+        job(tmp_path, "apex", 0),
+        job(tmp_path, "apex", 0, data="sprites"),
+        job(tmp_path, "apex", 0, scale="cpu", words=("+tuned=sigma", "model/apex/likelihood=gaussian")),
+        job(tmp_path, "mine", 0),
+        job(tmp_path, "apex", 0, "my_ablation"),
+    ]
+    for each in mixed:
+        named = {group: each.choices.get(group) for group in ("ablation", "data", "scale")}
+        scores = {"ari": 0.8, **({"mota": None} if each.choices["model"] == "mine" else {})}
+        run_folder(tmp_path, each.choices["model"], 0, scores, **named)
+    table = only(tmp_path, jobs=[each.again() for each in mixed], published=True)
+    assert [(each.label, each.tracking) for each in table.lines] == [
+        ("APEX", True),
+        ("APEX, data=sprites", True),
+        ("APEX, scale=cpu, tuned=sigma, likelihood=gaussian", True),
+        ("mine", False),
+        ("APEX, ablation=my_ablation", True),
+    ]
+    assert [block.title for block in table.blocks] == [None, "Not in the paper"]
+    assert [each.cells["ari"].published for each in table.lines] == [(0.93, 0.0), None, (0.93, 0.0), None, None]
+    assert "Data p2d and sprites, scale paper and cpu (not the paper's scale: cpu)" in table.caption
+    assert "Bold: best of all models but the yardsticks" in table.caption
+
+
+def test_rows_that_were_not_asked_for_are_not_there(tmp_path: Path) -> None:
+    table = only(tmp_path, jobs=[job(tmp_path, "apex", 0), job(tmp_path, "oracle", 0)], yardsticks=True)
+    assert [each.label for each in table.lines] == ["APEX", "Oracle"]
+    assert [block.title for block in table.blocks] == [None, "Tests of the evaluation"]
+
+
+def test_what_the_paper_says_of_its_data_is_said_of_no_other(tmp_path: Path) -> None:
+    jobs = [job(tmp_path, "apex", 0, "gaussian", data="sprites"), job(tmp_path, "gswm", 0, data="sprites")]
+    for number in (3, 1):
+        table = only(tmp_path, number, jobs=jobs, published=True)
+        assert table.footnotes == ()
+        assert not any(each.asterisk for each in table.lines)
 
 
 def test_the_scores_of_the_hand_made_runs_obey_the_identities() -> None:

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from apex_lab.base.errors import UserError
-from apex_lab.tables.found import SeedRun, collect, read_arrangement
+from apex_lab.tables.found import SeedRun, read_arrangement, read_run
 from apex_lab.training.learner import Diverged, Learner
 from apex_lab.training.update import WeightUpdate
 from tests.tables.folders import run_folder
@@ -19,15 +19,16 @@ from tests.tiny import Layers
 
 
 def only(outputs: Path) -> SeedRun:
-    found = collect(outputs)
-    assert len(found) == 1
-    return found[0]
+    (folder,) = outputs.glob("*/seed_*")
+    run = read_run(folder, int(folder.name.removeprefix("seed_")))
+    assert run is not None
+    return run
 
 
 def test_a_finished_run(tmp_path: Path) -> None:
     folder = run_folder(tmp_path, "apex", 3, {"ari_fg": 0.25, "motp": None, "notes": "words"})
     run = only(tmp_path)
-    assert (run.folder, run.seed, run.state, run.group) == (folder, 3, "finished", "apex_p2d_paper_0123abcd")
+    assert (run.folder, run.seed, run.state) == (folder, 3, "finished")
     assert run.scores["ari_fg"] == 0.25
     assert math.isnan(run.scores["motp"])
     assert "notes" not in run.scores
@@ -36,21 +37,8 @@ def test_a_finished_run(tmp_path: Path) -> None:
     assert run.failure is None
 
 
-def test_only_folders_of_seeds_count(tmp_path: Path) -> None:
-    run_folder(tmp_path, "apex", 10)
-    run_folder(tmp_path, "apex", 9)
-    (tmp_path / "apex_p2d_paper_0123abcd" / "seed_1_old").mkdir()
-    (tmp_path / "apex_p2d_paper_0123abcd" / "seed_01").mkdir()
-    (tmp_path / "tables" / "p2d_paper").mkdir(parents=True)
-    (tmp_path / "notes.txt").write_text("")
-    assert [run.seed for run in collect(tmp_path)] == [9, 10]
-    assert collect(tmp_path / "nowhere") == []
-
-
-def test_outputs_that_are_a_file(tmp_path: Path) -> None:
-    (tmp_path / "outputs").write_text("")
-    with pytest.raises(UserError, match=r"paths\.outputs = .*outputs cannot be read"):
-        collect(tmp_path / "outputs")
+def test_a_run_that_was_never_started(tmp_path: Path) -> None:
+    assert read_run(tmp_path / "seed_0", 0) is None
 
 
 def test_a_run_whose_outcome_is_diverged_makes_a_failed_seed(tmp_path: Path) -> None:
@@ -189,7 +177,6 @@ def test_damaged_files_are_told_in_one_sentence(name: str, content: bytes, tmp_p
     assert run.state == "damaged"
     assert str(folder / name) in str(run.why)
     assert "\n" not in str(run.why)
-    assert run.words == "apex_p2d_paper"
 
 
 @pytest.mark.parametrize("name", ["run.json", "metrics.json"])

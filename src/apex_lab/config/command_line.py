@@ -11,7 +11,7 @@ import re
 import shlex
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ from apex_lab.config.composition import (
     told,
 )
 from apex_lab.config.elsewhere import Origin
-from apex_lab.config.job_list import expand
+from apex_lab.config.job_list import expand, sweeps, tables_of
 from apex_lab.config.sweeps import Item, JobBusy, JobFailed, Known, Sweep
 
 Check = Callable[[dict[str, Any], dict[str, str], Sequence[str]], Any]
@@ -248,6 +248,57 @@ def take_words(wanted: Callable[[str], bool]) -> tuple[list[str], str | None]:
     for word in taken:
         sys.argv.remove(word)
     return taken, arguments.config_dir
+
+
+def listed(overrides: Sequence[str], config_dir: str | None = None) -> list[Composed]:
+    """Composes every job that `apex_lab.train` would start with `-m`, for commands that read what runs left behind.
+
+    Values are not checked (that needs PyTorch): `apex_lab.config.schema.check_job` does that.
+
+    Args:
+        overrides: the words of the command.
+        config_dir: a further folder of configuration files.
+
+    Raises:
+        UserError: what Hydra refuses, in one sentence.
+    """
+    overrides, extra = full_names(overrides), _search_path(config_dir)
+    with composing(overrides):
+        _check_hydra_keys("train", extra, overrides)
+        _check_groups("train", overrides)
+        jobs = expand([*_swept_by_files("train", extra, overrides), *overrides], extra)
+        return list(_composed(check_training, "train", extra, jobs))
+
+
+def sweep_tables(overrides: Sequence[str], config_dir: str | None = None) -> list[int] | None:
+    """Numbers of the tables that the sweeps of a command make; None where a sweep names none.
+
+    Raises:
+        UserError: a sweep is not there.
+    """
+    with composing(overrides):
+        return tables_of(sweeps(overrides), _search_path(config_dir))
+
+
+def plain_fingerprints(jobs: Sequence[tuple[str, ...]], config_dir: str | None = None) -> list[str]:
+    """The identity of the configuration that each list of words makes.
+
+    Raises:
+        UserError: words that Hydra refuses.
+    """
+    with composing([word for job in jobs for word in job]):
+        return [made.identity for made in composed("train", jobs, _search_path(config_dir))]
+
+
+def check_training(raw: dict[str, Any], choices: Mapping[str, str], words: Sequence[str]) -> Any:
+    """`apex_lab.config.schema.check_job`, imported when it is needed.
+
+    Raises:
+        UserError: what is wrong, in one sentence.
+    """
+    from apex_lab.config.schema import check_job  # imports PyTorch, which most commands that read runs never need
+
+    return check_job(raw, choices, words)
 
 
 def _search_path(config_dir: str | None) -> list[str]:

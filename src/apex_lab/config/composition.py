@@ -23,6 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, sentence
 from apex_lab.config import trust
+from apex_lab.config.upgrades import fingerprint
 
 CHOICES = ("model", "ablation", "data", "scale", "experiment", "tuned")
 """Groups that name a run; a run has one choice of each."""
@@ -39,14 +40,17 @@ class Composed:
     """One configuration as Hydra composes it.
 
     Attributes:
-        raw: plain containers, all interpolations resolved, without Hydra's own part.
+        raw: plain containers, all interpolations resolved, without Hydra's own part; seeds of one configuration share
+            all but the seed, so it is not to be changed.
         choices: group -> the word chosen for it.
         words: the overrides that made it.
+        identity: its fingerprint, common to its seeds.
     """
 
     raw: dict[str, Any]
     choices: dict[str, str]
     words: tuple[str, ...]
+    identity: str
 
 
 def conf_dir() -> Path:
@@ -134,26 +138,64 @@ def composed(
         jobs: the words of each.
         extra: words for Hydra that belong to all, such as a search path.
     """
-    templates: dict[tuple[str, ...], tuple[DictConfig, dict[str, str]]] = {}
+    templates: dict[tuple[str, ...], _Template] = {}
     for words in jobs:
         rest = tuple(word for word in words if not word.startswith("seed="))
         if rest not in templates:
-            templates[rest] = _template(name, [*extra, *words])
-        config, choices = templates[rest]
+            templates[rest] = _Template(name, [*extra, *words])
+        template = templates[rest]
         for word in words:
             if word.startswith("seed="):
-                OmegaConf.update(config, "seed", OverridesParser.create().parse_override(word).value())
-        yield Composed(plain(config), choices, tuple(words))
+                template.reseed(word)
+        raw, identity = template.resolved()
+        yield Composed(raw, template.choices, tuple(words), identity)
 
 
-def _template(name: str, words: Sequence[str]) -> tuple[DictConfig, dict[str, str]]:
-    """An unresolved configuration and its choices."""
-    config = compose(name, overrides=list(words), return_hydra_config=True)
-    choices = chosen(config.hydra.runtime)
-    _check_tuned(choices, config.hydra.runtime)
-    own = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
-    OmegaConf.set_struct(own, False)
-    return own, choices
+class _Template:
+    """A composed configuration whose seed changes."""
+
+    def __init__(self, name: str, words: Sequence[str]) -> None:
+        config = compose(name, overrides=list(words), return_hydra_config=True)
+        self.choices = chosen(config.hydra.runtime)
+        _check_tuned(self.choices, config.hydra.runtime)
+        self._config = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+        OmegaConf.set_struct(self._config, False)
+        # nothing but the seed itself depends on it, so the rest is resolved once
+        self._apart = not re.search(r"\$\{[^}]*seed", str(OmegaConf.to_container(self._config, resolve=False)))
+        self._resolved: tuple[dict[str, Any], str] | None = None
+        self._seed: dict[str, Any] = {}
+
+    def reseed(self, word: str) -> None:
+        """Takes another seed, as the command line gives it."""
+        value = word.removeprefix("seed=")
+        seed = (
+            int(value) if re.fullmatch(r"0|[1-9]\d*", value) else OverridesParser.create().parse_override(word).value()
+        )
+        self._seed = {"seed": seed}
+
+    def resolved(self) -> tuple[dict[str, Any], str]:
+        """The configuration with its seed, and its fingerprint."""
+        if self._apart and self._resolved is not None:
+            raw, identity = self._resolved
+            return {**raw, **self._seed}, identity
+        for key, value in self._seed.items():
+            OmegaConf.update(self._config, key, value)
+        raw = plain(self._config)
+        self._resolved = raw, fingerprint(raw)
+        return self._resolved
+
+
+def outputs_folder(words: Sequence[str]) -> Path:
+    """The folder of runs.
+
+    Args:
+        words: those of a command line that begin with `paths.`.
+
+    Raises:
+        UserError: they set no folder.
+    """
+    with composing(words):
+        return Path(str(plain(compose("train", overrides=list(words)))["paths"]["outputs"]))
 
 
 def _check_tuned(choices: Mapping[str, str], runtime: Any) -> None:
@@ -182,13 +224,10 @@ def told(error: Exception, overrides: Sequence[str]) -> str:
     given = {word.split("=", 1)[0].lstrip("+~"): word.lstrip("+~") for word in overrides}
     if isinstance(error, MissingConfigException) and error.options is not None:
         group, _, word = str(error.missing_cfg_file).rpartition("/")
-<<<<<<< HEAD
         if group == "tuned" and not error.options:
             return f"tuned={word}: no study has written its values here; docs/tuning.md says how one does."
-=======
         if group == "hydra/launcher" and word in EXTRAS:
             return f"{group}={word} needs a package that is not installed: pip install 'apex-lab[{EXTRAS[word]}]'."
->>>>>>> launchers
         guess = did_you_mean(word, error.options)
         return sentence(f"{group}={word}: there is no such choice in {', '.join(error.options)}{guess}")
     several = re.match(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)

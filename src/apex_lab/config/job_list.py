@@ -20,6 +20,7 @@ from typing import Any
 from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 from pydantic import BaseModel, ConfigDict
 
@@ -33,12 +34,19 @@ Value = str | int | float | bool | None
 
 
 class SweepFile(BaseModel):
-    """What a file in conf/sweep/ may hold."""
+    """What a file in conf/sweep/ may hold.
+
+    Attributes:
+        jobs: entries: key -> value or values.
+        include: other sweeps.
+        tables: numbers of the paper's tables that it makes; None: all that are made from scores.
+    """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     jobs: tuple[dict[str, Value | tuple[Value, ...]], ...] = ()
     include: tuple[str, ...] = ()
+    tables: tuple[int, ...] | None = None
 
 
 def expand(overrides: Sequence[str], extra: Sequence[str] = ()) -> list[Words]:
@@ -101,17 +109,43 @@ def read_sweep(name: str, extra: Sequence[str] = (), seen: Words = ()) -> list[d
     """
     if name in seen:
         raise UserError(f"conf/sweep/{seen[0]}.yaml includes itself ({' > '.join([*seen, name])}).")
-    node: Any = OmegaConf.to_container(compose("train", overrides=[*extra, f"+sweep={name}"]).sweep, resolve=False)
-    described = f"conf/sweep/{name}.yaml"
-    file = validate(SweepFile, node if isinstance(node, dict) else {"": node}, described)
-    assert isinstance(file, SweepFile)
+    file = _read(name, extra)
     if not file.jobs and not file.include:
-        raise UserError(f"{described} lists no jobs.")
+        raise UserError(f"{_place(name)} lists no jobs.")
     entries = [{key: _listed(key, value) for key, value in entry.items()} for entry in file.jobs]
-    trust.only_words((word for entry in entries for words in entry.values() for word in words), described)
+    trust.only_words((word for entry in entries for words in entry.values() for word in words), _place(name))
     for other in file.include:
         entries += read_sweep(other, extra, (*seen, name))
     return entries
+
+
+def sweeps(overrides: Sequence[str]) -> list[str]:
+    """The names that a command gives as `+sweep=`."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    return [name for override in parsed if override.key_or_group == "sweep" for name in _values(override)]
+
+
+def tables_of(names: Sequence[str], extra: Sequence[str] = ()) -> list[int] | None:
+    """Numbers of the tables that sweeps make; None where one of them makes all that its jobs have scores for."""
+    files = [_read(name, extra) for name in names]
+    numbers = {number for file in files for number in file.tables or ()}
+    return None if any(file.tables is None for file in files) else sorted(numbers)
+
+
+def _read(name: str, extra: Sequence[str]) -> SweepFile:
+    try:
+        sweep = compose(f"sweep/{name}", overrides=list(extra)).sweep
+    except MissingConfigException:
+        sweep = compose("train", overrides=[*extra, f"+sweep={name}"]).sweep  # tells which there are
+    node = OmegaConf.to_container(sweep, resolve=False)
+    content = {str(key): value for key, value in node.items()} if isinstance(node, dict) else {"": node}
+    file = validate(SweepFile, content, _place(name))
+    assert isinstance(file, SweepFile)
+    return file
+
+
+def _place(name: str) -> str:
+    return f"conf/sweep/{name}.yaml"
 
 
 def _listed(key: str, value: Any) -> list[str]:

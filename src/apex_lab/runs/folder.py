@@ -30,53 +30,20 @@ from apex_lab.base import console
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import drafts, make_folder, read_json, set_aside, write_json, write_text
 from apex_lab.config.schema import Job
-from apex_lab.config.upgrades import FORMAT, fingerprint, upgraded
-from apex_lab.runs import provenance
+from apex_lab.config.upgrades import FORMAT, fingerprint
+from apex_lab.runs import identity, provenance
 from apex_lab.runs.state import LOCK, RECORD
 
 
 def group_name(job: Job) -> str:
     """Name of the configuration, common to all its seeds."""
-    return f"{_words(job)}_{fingerprint(job.raw)[:8]}"
+    return identity.group_name(fingerprint(job.raw), job.choices)
 
 
 def run_folder(job: Job) -> Path:
     """Where a job's run lies: the folder of its name, or one of an older version with the same identity."""
-    outputs, seed = Path(job.config.paths.outputs), f"seed_{job.config.seed}"
-    named = outputs / group_name(job) / seed
-    if not named.exists():
-        for older in sorted(outputs.glob(f"{_words(job)}_*/{seed}")):
-            if _same_run(older, job):
-                return older
-    return named
-
-
-def _words(job: Job) -> str:
-    named = {group: job.choices.get(group) for group in ("model", "ablation", "tuned", "data", "scale")}
-    return "_".join(f"tuned_{word}" if group == "tuned" else word for group, word in named.items() if word)
-
-
-def _same_run(folder: Path, job: Job) -> bool:
-    """Whether a folder that an older version of apex_lab named holds this job's run."""
-    wanted = fingerprint(job.raw)
-    try:
-        record = read_json(folder / RECORD)
-        format = record.get("format", 1)
-        if format == FORMAT:  # begun by an older version, resumed by this one
-            return record.get("fingerprint") == wanted
-        formats = [format] if isinstance(format, int) and 1 <= format < FORMAT else []
-    except UserError:
-        formats = [*range(1, FORMAT + 1)]  # lost or damaged; the configuration still tells
-    return any(_stored_fingerprint(folder, format) == wanted for format in formats)
-
-
-def _stored_fingerprint(folder: Path, format: int) -> str | None:
-    """The identity of a folder's configuration, read as one of a given format; None where it is not."""
-    try:
-        stored = yaml.safe_load((folder / "config.yaml").read_text())
-        return fingerprint(upgraded(stored, format))
-    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError):
-        return None
+    outputs = identity.Outputs(Path(job.config.paths.outputs))
+    return identity.run_folder(outputs, fingerprint(job.raw), job.choices, job.config.seed)
 
 
 Outcome = Literal["finished", "paused", "failed", "interrupted", "diverged", "pruned"]
@@ -223,6 +190,7 @@ class Run:
             "finished": None,
             "seconds": self.record.get("seconds", 0.0),  # of training, over all restarts
             "steps": self.record.get("steps", 0),
+            "max_steps": config.trainer.max_steps,
             "history": history,
             "command": command,
             "overrides": list(self.job.overrides),

@@ -9,8 +9,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import torch
-
 import apex_lab
 from sims.bullet import pybullet_version
 
@@ -39,8 +37,10 @@ def commit() -> tuple[str | None, bool | None]:
     return head, bool(_git(folder, "status", "--porcelain", "--untracked-files=no"))
 
 
-def hardware(device: torch.device) -> dict[str, Any]:
-    """The machine and the device that the model runs on."""
+def hardware(device: Any) -> dict[str, Any]:
+    """The machine and the device (a `torch.device`) that the model runs on."""
+    import torch  # commands that read runs need the rest of this module, and no PyTorch
+
     about: dict[str, Any] = {
         "system": platform.platform(),
         "cpu": _cpu_name(),

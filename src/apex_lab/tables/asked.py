@@ -1,89 +1,93 @@
-"""Makes the paper's tables from the runs that are there, and prints the commands of the others.
+"""Makes the paper's tables from the runs of a sweep, and the commands of what is missing.
 
-python -m apex_lab.tables
-python -m apex_lab.tables scale=cpu tables=[1,3]
+python -m apex_lab.tables +sweep=ablations scale=cpu   the table of a sweep: a row is a configuration of its jobs
+python -m apex_lab.tables                              all tables, from the runs of +sweep=paper
+python -m apex_lab.tables scale=cpu tables=[1,3]       keys of its own: conf/tables.yaml; all other words name jobs
 """
 
 from __future__ import annotations
 
 import importlib.util
-import sys
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from hydra import compose
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.object_type import ObjectType
-from hydra.errors import HydraException
-from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel, ConfigDict, Field
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json, write_text
-from apex_lab.base.validation import shown, validate
+from apex_lab.base.validation import did_you_mean, shown, validate
 from apex_lab.config import command_line as cli
-from apex_lab.config import schema as config
-from apex_lab.config.composition import plain
-from apex_lab.runs import folder as runs
+from apex_lab.config.composition import CHOICES, composing, plain
+from apex_lab.config.job_list import sweeps
+from apex_lab.config.reader import Reader, ending
 from apex_lab.runs import provenance
+from apex_lab.runs.listed import Listed, listed
 from apex_lab.tables import definition as spec
 from apex_lab.tables import latex, markdown
 from apex_lab.tables import output_files as export
 from apex_lab.tables.build import Built, build
-from apex_lab.tables.choose import Choice, Version, choose
-from apex_lab.tables.found import SeedRun, collect
+from apex_lab.tables.configurations import configurations, plain_words
 from apex_lab.tables.missing_runs import Command, missing_runs
 from apex_lab.tables.rows import Options
 
-GROUPS = ("data", "scale", "paths")
-"""Groups that choose which runs are read."""
+EVERYTHING = "+sweep=paper"
 
 
 class TablesConfig(BaseModel):
-    """The keys of conf/tables.yaml that can be set."""
+    """The keys of conf/tables.yaml."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    tables: tuple[int, ...] = Field(min_length=1)
-    seeds: tuple[Annotated[int, Field(ge=0)], ...] = Field(min_length=1)
+    tables: tuple[int, ...] | None = Field(min_length=1)
     exclude_failed: tuple[str, ...]
-    groups: tuple[str, ...]
     published: bool
     yardsticks: bool
     arrangement_mean: Literal["scenario", "object"]
     folder: str | None = Field(min_length=1)
     dry_run: bool
-    paths: config.PathsPart
 
 
 @dataclass(frozen=True)
 class Tables:
-    """One checked command: what is asked for, on which data and scale, and the folders."""
+    """What is asked for.
+
+    Attributes:
+        asked: the command's own keys.
+        words: those that name the jobs, `+sweep=` among them.
+        jobs: with their runs.
+        numbers: of the tables that the sweep makes; None: of all that have rows and are made from scores.
+        specification: of the tables.
+        config_dir: a further folder of configuration files.
+    """
 
     asked: TablesConfig
-    data: str
-    scale: str
+    words: tuple[str, ...]
+    jobs: tuple[Listed, ...]
+    numbers: tuple[int, ...] | None
     specification: spec.Specification
-    paths: tuple[str, ...]
+    config_dir: str | None = None
 
     @property
     def folder(self) -> Path:
         """Where the tables go."""
         if self.asked.folder is not None:
             return Path(self.asked.folder)
-        return Path(self.asked.paths.outputs) / "tables" / f"{self.data}_{self.scale}"
+        named = [word for group in ("data", "scale") for word in dict.fromkeys(j.choices[group] for j in self.jobs)]
+        changes = list(dict.fromkeys(word.lstrip("+") for job in self.jobs for word in job.changes))
+        words = "_".join([*sweeps(self.words), *named, *changes])
+        outputs = str(self.jobs[0].raw["paths"]["outputs"])
+        return Path(outputs) / "tables" / re.sub(r"[^\w.=,+-]+", "-", words)[:150]
 
     @property
     def options(self) -> Options:
         """What the parts of this package need to know of it."""
         asked = self.asked
         return Options(
-            data=self.data,
-            scale=self.scale,
-            seeds=asked.seeds,
             exclude_failed=asked.exclude_failed,
             published=asked.published,
             yardsticks=asked.yardsticks,
@@ -91,136 +95,129 @@ class Tables:
         )
 
 
+@dataclass(frozen=True)
+class Made:
+    """Tables, and the commands of what they lack."""
+
+    tables: tuple[Built, ...]
+    commands: tuple[Command, ...]
+
+
 def main() -> None:
     """Entry point: `python -m apex_lab.tables`."""
-    try:
-        # before anything is composed: a group of a run may need others that tables do not have
-        _refuse_foreign({}, [word for word in sys.argv[1:] if not word.startswith("-")])
-    except UserError as error:
-        console.setup()
-        console.error(str(error))
-        sys.exit(cli.CONFIG_ERROR)
-    cli.launch(cli.Command("tables", check_tables, make_tables, lambda job: f"tables of {job.data}, {job.scale}"))
+    reader = Reader("tables", __doc__ or "")
+    with ending():
+        given = reader.asked()
+        job = asked(given.words, given.config_dir)
+        made = assemble(job)
+    with ending(cli.RUN_ERROR):
+        console.say(markdown.document(made.tables, job.asked.published, made.commands).rstrip("\n"))
+        if not job.asked.dry_run:
+            for path in store(job, made):
+                console.say(str(path))
 
 
-def check_tables(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str]) -> Tables:
-    """Checks the command.
+def read_tables(words: Sequence[str], config_dir: str | None = None) -> Made:
+    """The tables of a command line, for other programs.
+
+    Args:
+        words: as after `python -m apex_lab.tables`.
+        config_dir: a further folder of configuration files.
+
+    Raises:
+        UserError: the words are wrong.
+    """
+    return assemble(asked(words, config_dir))
+
+
+def asked(words: Sequence[str], config_dir: str | None = None) -> Tables:
+    """Reads and checks a command line, and finds the runs of its jobs.
 
     Raises:
         UserError: unknown key, impossible value, unknown table or model; one sentence.
     """
-    _refuse_foreign(choices, overrides)
-    foreign = {*config.Config.model_fields} - {*TablesConfig.model_fields}
-    asked = validate(TablesConfig, {k: v for k, v in raw.items() if k not in foreign and k != "hydra"}, "")
-    assert isinstance(asked, TablesConfig)
+    own = [word for word in words if _key(word) in TablesConfig.model_fields]
+    rest = [word for word in words if word not in own]
+    for word in rest:
+        if _key(word) == "seeds":
+            raise UserError(f"{word}: the seeds of a row are those of its jobs; write seed=0,1 for two of them.")
+    with composing(own):
+        settings = validate(TablesConfig, plain(compose("tables", overrides=own)), "")
+        assert isinstance(settings, TablesConfig)
+        rest = rest if sweeps(rest) else [EVERYTHING, *rest]
     specification = spec.load()
     numbers = [table.number for table in specification.tables]
-    for number in asked.tables:
+    for number in settings.tables or ():
         if number not in numbers:
-            raise UserError(f"tables = {shown(asked.tables)} is wrong: there are {', '.join(map(str, numbers))}.")
-    for model in asked.exclude_failed:
-        if model not in specification.models:
-            raise UserError(f"exclude_failed: there is no model '{model}' in {', '.join(specification.models)}.")
-    if len(set(asked.seeds)) < len(asked.seeds):
-        raise UserError(f"seeds = {shown(asked.seeds)} is wrong: name each seed once.")
-    paths = tuple(word.lstrip("+") for word in overrides if word.lstrip("+").startswith("paths."))
-    return Tables(asked, choices["data"], choices["scale"], specification, paths)
-
-
-def _refuse_foreign(choices: Mapping[str, str], overrides: Sequence[str]) -> None:
-    """Tables read runs as they are: words that would change a run are refused, not ignored."""
-    keys = {word.split("=", 1)[0].lstrip("+~"): word for word in overrides}
-    for key, word in keys.items():
-        group, _, inside = key.partition(".")
-        changes_run = group in config.Config.model_fields and group != "paths"
-        if (changes_run and (inside or group not in GROUPS)) or (group in choices and group not in GROUPS):
-            hint = "; write seeds=[...]" if group == "seed" else ""
-            raise UserError(f"{word} belongs to apex_lab.train; tables take finished runs as they are{hint}.")
-
-
-def make_tables(job: Tables) -> None:
-    """Reads the runs, prints the tables and the missing runs' commands, and stores both.
-
-    Raises:
-        UserError: run folders that were asked for do not exist or fit no row; a folder that cannot be read or written.
-    """
-    found = collect(Path(job.asked.paths.outputs))
-    tables, commands, problems = assemble(found, job, this_version())
-    published = job.asked.published
-    console.say(markdown.document(tables, published, commands, problems).rstrip("\n"))
-    if not job.asked.dry_run:
-        for path in store(job, tables, commands, problems):
-            console.say(str(path))
-
-
-def assemble(found: Sequence[SeedRun], job: Tables, version: Version) -> tuple[list[Built], list[Command], list[str]]:
-    """All tables, the commands for missing runs, and a sentence for every damaged run that belongs to no row.
-
-    Raises:
-        UserError: run folders that were asked for do not exist or fit no row.
-    """
-    specification, options, groups = job.specification, job.options, job.asked.groups
-    wanted = [table for table in specification.tables if table.number in job.asked.tables]
-    sections = [section for table in wanted for section in specification.sections(table, options.yardsticks)]
-    rows = dict.fromkeys(row.run for section in sections for row in section.rows)
-    choices: dict[tuple[str, str | None], Choice] = {
-        row: choose(found, row, job.data, job.scale, groups, version) for row in rows
-    }
-    _refuse_unused(groups, choices, found, job)
-    tables = [built for table in wanted for built in build(table, specification, choices, options)]
-    commands = missing_runs(tables, choices, options, groups, version, job.asked.paths.outputs, job.paths)
-    shown_folders = {run.folder for choice in choices.values() if choice.group for run in choice.group.runs.values()}
-    problems = [str(run.why) for run in found if run.state == "damaged" and run.folder not in shown_folders]
-    return tables, commands, problems
-
-
-def _refuse_unused(
-    groups: Sequence[str], choices: Mapping[tuple[str, str | None], Choice], found: Sequence[SeedRun], job: Tables
-) -> None:
-    taken = {choice.group.name for choice in choices.values() if choice.group}
-    there = {run.group for run in found}
-    for name in groups:
-        if name not in there:
-            raise UserError(f"groups: there are no runs in {Path(job.asked.paths.outputs) / name}.")
-        if name not in taken:
-            raise UserError(f"groups: {name} fits no row of these tables, or another one was taken for its row.")
-
-
-def this_version() -> Version:
-    """What this version can run, as Hydra composes it; to be called while an entry point runs."""
-    loader = GlobalHydra.instance().config_loader()
-
-    def fingerprint(words: Sequence[str]) -> str | None:
-        try:
-            raw = plain(compose("train", overrides=list(words)))
-        except (HydraException, OmegaConfBaseException, UserError):
-            return None  # this version has no such configuration; the row notes it
-        return runs.fingerprint(raw)
-
-    return Version(
-        models=loader.get_group_options("model", ObjectType.CONFIG),
-        ablations=loader.get_group_options("ablation", ObjectType.CONFIG),
-        fingerprint=fingerprint,
-        arrange=importlib.util.find_spec("apex_lab.arrange") is not None,
+            raise UserError(f"tables = {shown(settings.tables)} is wrong: there are {', '.join(map(str, numbers))}.")
+    try:
+        jobs = listed(rest, config_dir)
+    except UserError:
+        _refuse_misspelt(rest)
+        raise
+    models = dict.fromkeys([*specification.models, *(job.choices["model"] for job in jobs)])
+    for model in settings.exclude_failed:
+        if model not in models:
+            raise UserError(f"exclude_failed: there is no model '{model}' in {', '.join(models)}.")
+    found = settings.tables or cli.sweep_tables(rest, config_dir)
+    return Tables(
+        settings, tuple(rest), tuple(jobs), None if found is None else tuple(found), specification, config_dir
     )
 
 
-def store(job: Tables, tables: Sequence[Built], commands: Sequence[Command], problems: Sequence[str]) -> list[Path]:
+def _key(word: str) -> str:
+    return word.partition("=")[0].lstrip("+~")
+
+
+def _refuse_misspelt(words: Sequence[str]) -> None:
+    """A word that names no job may be a key of tables that is misspelt."""
+    for word in words:
+        guess = did_you_mean(_key(word), [*TablesConfig.model_fields])
+        if guess and _key(word) not in CHOICES:
+            raise UserError(f"Unknown key {word.lstrip('+~')}{guess}.")
+
+
+def assemble(job: Tables) -> Made:
+    """All tables with the commands of what they lack.
+
+    Raises:
+        UserError: no job has a row in a table that was asked for.
+    """
+    changed = list(dict.fromkeys(plain_words(each) for each in job.jobs if each.changes))
+    found = dict(zip(changed, cli.plain_fingerprints(changed, job.config_dir), strict=True)) if changed else {}
+    rows = configurations(job.jobs, found)
+    tables = []
+    for table in job.specification.tables:
+        if table.number in job.numbers if job.numbers is not None else table.source == "metrics":
+            built = build(table, job.specification, rows, job.options)
+            if not built and table.number in (job.asked.tables or ()):
+                raise UserError(f"None of these jobs has a row in table {table.number}: {' '.join(job.words)}.")
+            tables += built
+    if not tables:
+        raise UserError(f"None of these jobs has a row in a table: {' '.join(job.words)}.")
+    all_shown = {line.configuration.name for table in tables for line in table.lines} == {row.name for row in rows}
+    arrange = importlib.util.find_spec("apex_lab.arrange") is not None
+    words = job.words if all_shown else None
+    commands = missing_runs(tables, words, job.asked.exclude_failed, arrange, job.config_dir)
+    return Made(tuple(tables), tuple(commands))
+
+
+def store(job: Tables, made: Made) -> list[Path]:
     """Writes tables.md, tables.tex, tables.json and table_<number>.csv; their paths.
 
     tables.json holds what `export.as_json` returns, `asked` (what was asked for) and `made_by` (which version).
     """
     folder, published = make_folder(job.folder), job.asked.published
     paths = [folder / name for name in ("tables.md", "tables.tex", "tables.json")]
-    write_text(paths[0], markdown.document(tables, published, commands, problems))
-    write_text(paths[1], latex.document(tables, published, commands))
+    write_text(paths[0], markdown.document(made.tables, published, made.commands))
+    write_text(paths[1], latex.document(made.tables, published, made.commands))
     commit, dirty = provenance.commit()
-    about = {
-        "asked": {"data": job.data, "scale": job.scale, **job.asked.model_dump()},
+    about: dict[str, Any] = {
+        "asked": {"words": list(job.words), **job.asked.model_dump()},
         "made_by": {"versions": provenance.versions(), "commit": commit, "dirty": dirty},
     }
-    write_json(paths[2], {**about, **export.as_json(tables, commands, problems)})
-    for table in tables:
+    write_json(paths[2], {**about, **export.as_json(made.tables, made.commands)})
+    for table in made.tables:
         paths.append(folder / f"table_{table.number}.csv")
         write_text(paths[-1], export.as_csv(table))
     return paths

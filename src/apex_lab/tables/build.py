@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from apex_lab.tables.choose import Choice, difference
-from apex_lab.tables.definition import Column, Row, Specification, Table
-from apex_lab.tables.found import Protocol
+from apex_lab.tables.configurations import DATA, SCALE, Configuration, difference
+from apex_lab.tables.definition import Column, Row, Section, Specification, Table
+from apex_lab.tables.found import Protocol, and_list
 from apex_lab.tables.rows import DDOF, TRACKING, Line, Options, make_line, rounded
 
 COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
@@ -44,32 +44,47 @@ class Built:
 
 
 def build(
-    table: Table,
-    specification: Specification,
-    choices: Mapping[tuple[str, str | None], Choice],
-    options: Options,
+    table: Table, specification: Specification, configurations: Sequence[Configuration], options: Options
 ) -> list[Built]:
-    """Fills a table, and its variant if it has one.
+    """Fills a table, and its variant if it has one; nothing where no configuration has a row in it.
 
     Args:
         table: its specification.
         specification: where it comes from.
-        choices: (model, ablation) -> the runs of the row.
+        configurations: of the jobs.
         options: of the command.
     """
-    built = [_build(table, specification, choices, options)]
+    sections = _sections(table, specification, configurations, options)
+    if not any(section.rows for section in sections):
+        return []
+    built = [_build(table, sections, specification, configurations, options)]
     if table.variant is not None:
         suffix = table.variant.suffix
         columns = tuple(column if column.key == TRACKING else _renamed(column, suffix) for column in table.columns)
-        sections = tuple(
+        renamed = [
             section.model_copy(update={"rows": tuple(_suffixed(row, suffix) for row in section.rows)})
-            for section in specification.sections(table, options.yardsticks)
-        )
-        again = table.model_copy(
-            update={"caption": table.variant.caption, "columns": columns, "sections": sections, "yardsticks": False}
-        )
-        built.append(replace(_build(again, specification, choices, options), number=table.variant.number))
+            for section in sections
+        ]
+        again = table.model_copy(update={"caption": table.variant.caption, "columns": columns})
+        variant = _build(again, renamed, specification, configurations, options)
+        built.append(replace(variant, number=table.variant.number))
     return built
+
+
+def _sections(
+    table: Table, specification: Specification, configurations: Sequence[Configuration], options: Options
+) -> list[Section]:
+    """The paper's rows that were run, rows that no table of the paper has, and yardsticks."""
+    run = {configuration.row for configuration in configurations}
+    others = [row for row in dict.fromkeys(c.row for c in configurations) if row not in specification.rows]
+    found = [
+        section.model_copy(update={"rows": tuple(row for row in section.rows if row.run in run)})
+        for section in specification.sections(table, options.yardsticks)
+    ]
+    if others and table.source == "metrics":
+        rows = tuple(Row(model=model, ablation=ablation) for model, ablation in others)
+        found.insert(len(table.sections), Section(title="Not in the paper", rows=rows))
+    return [section for section in found if section.rows]
 
 
 def _renamed(column: Column, suffix: str) -> Column:
@@ -90,13 +105,18 @@ def _suffixed(row: Row, suffix: str) -> Row:
 
 def _build(
     table: Table,
+    sections: Sequence[Section],
     specification: Specification,
-    choices: Mapping[tuple[str, str | None], Choice],
+    configurations: Sequence[Configuration],
     options: Options,
 ) -> Built:
-    sections = specification.sections(table, options.yardsticks)
     parts = [
-        [make_line(row, section.candidates, table, specification, choices[row.run], options) for row in section.rows]
+        [
+            make_line(row, section.candidates, table, specification, configuration, options)
+            for row in section.rows
+            for configuration in configurations
+            if configuration.row == row.run
+        ]
         for section in sections
     ]
     protocol = _main_protocol(line for part in parts for line in part)
@@ -113,7 +133,7 @@ def _build(
     return Built(
         str(table.number),
         table.source,
-        _caption(table, protocol, options),
+        _caption(table, protocol, [line.configuration for line in lines], specification, options),
         table.decimals,
         table.arrows,
         table.columns,
@@ -163,9 +183,20 @@ def _with_best(line: Line, best: Mapping[str, str], table: Table) -> Line:
     return replace(line, cells={**line.cells, **cells})
 
 
-def _caption(table: Table, protocol: Protocol | None, options: Options) -> str:
+def _caption(
+    table: Table,
+    protocol: Protocol | None,
+    configurations: Sequence[Configuration],
+    specification: Specification,
+    options: Options,
+) -> str:
     """The caption's facts: data, scale, videos, what the deviation is over."""
-    parts = [f"{table.caption}. Data {options.data}, scale {options.scale}"]
+    data = list(dict.fromkeys(each.data for each in configurations))
+    scales = list(dict.fromkeys(each.scale for each in configurations))
+    parts = [f"{table.caption}. Data {and_list(data)}, scale {and_list(scales)}"]
+    others = [scale for scale in scales if scale != SCALE]
+    if others:
+        parts[0] += f" (not the paper's scale{'' if len(scales) == len(others) else f': {and_list(others)}'})"
     if protocol is not None:
         if protocol.videos is not None and table.source == "metrics":
             parts[0] += f", {protocol.videos} test videos"
@@ -173,8 +204,7 @@ def _caption(table: Table, protocol: Protocol | None, options: Options) -> str:
             parts[0] += f", fingerprint {protocol.data_fingerprint[:8]}"
     if table.source == "metrics":
         parts.append(
-            f"Mean ± standard deviation (ddof = {DDOF}) over random seeds; {len(options.seeds)} seeds are asked for "
-            f"({', '.join(str(seed) for seed in options.seeds)}), the last column counts those in the mean"
+            f"Mean ± standard deviation (ddof = {DDOF}) over random seeds; the last column counts the seeds in the mean"
         )
     else:
         over = "objects" if options.arrangement_mean == "object" else "scenarios (each the mean of its objects)"
@@ -182,11 +212,12 @@ def _caption(table: Table, protocol: Protocol | None, options: Options) -> str:
             f"Mean ± standard deviation (ddof = {DDOF}) over {over} of all seeds that the last column counts; "
             "an object that fell off the table counts as 1 m"
         )
-    if options.published:
+    if options.published and DATA in data:
         parts.append("In parentheses: the paper's values")
-        if options.scale != "paper":
-            parts[-1] += f", which are of scale paper and cannot be compared with scale {options.scale}"
-    parts.append("Bold: best of the paper's models")
+        if others:
+            parts[-1] += f", which are of scale {SCALE} and cannot be compared with scale {and_list(others)}"
+    own = any(each.row not in specification.rows for each in configurations)
+    parts.append("Bold: best of all models but the yardsticks" if own else "Bold: best of the paper's models")
     return ". ".join(parts) + "."
 
 
@@ -204,7 +235,7 @@ def _footnotes(lines: Sequence[Line], options: Options) -> list[str]:
             if options.published and ours != theirs:
                 text += f" The paper excludes {_seeds(theirs)}."
         else:
-            text = f"* The paper's {line.label} results are computed with {_seeds(theirs)} being excluded"
+            text = f"* The paper's {line.name} results are computed with {_seeds(theirs)} being excluded"
             text += "; ours with none." if line.counted else "."
         found.append(text)
     if any(line.row.fails for line in lines):

@@ -27,7 +27,6 @@ class Model(_Part):
     label: str
     latex: str | None = None
     tracking: bool
-    seeds: tuple[int, ...] | None = None
 
 
 class Column(_Part):
@@ -83,7 +82,7 @@ class Variant(_Part):
 class Table(_Part):
     """One table of the paper.
 
-    `source`: metrics.json or arrangement.json of the runs. `seeds`: where it needs others than those asked for.
+    `source`: metrics.json or arrangement.json of the runs. `seeds`: where it needs fewer than its jobs have.
     """
 
     number: int
@@ -110,13 +109,24 @@ class Specification(_Part):
         """The rows of a table, with or without those below its last rule."""
         return table.sections + (self.yardsticks if yardsticks and table.yardsticks else ())
 
+    @property
+    def rows(self) -> set[tuple[str, str | None]]:
+        """Models and ablations that stand in any table."""
+        sections = [section for table in self.tables for section in self.sections(table, yardsticks=True)]
+        return {row.run for section in sections for row in section.rows}
+
     def label(self, row: Row) -> str:
-        """The label of a row."""
-        return row.label or self.models[row.model].label
+        """The label of a row; a model that the tables do not know has its word."""
+        if row.label is not None:
+            return row.label
+        model = self.models[row.model].label if row.model in self.models else row.model
+        return f"{model}, ablation={row.ablation}" if row.ablation else model
 
     def latex(self, row: Row) -> str | None:
         """The label in LaTeX, where that differs."""
-        return row.latex if row.label else self.models[row.model].latex
+        if row.label is not None:
+            return row.latex
+        return self.models[row.model].latex if row.model in self.models and not row.ablation else None
 
 
 class _Models(_Part):

@@ -1,4 +1,4 @@
-"""What run folders hold: every seed with its state and scores, and a sentence for every file that cannot be read."""
+"""What a run folder holds: a seed with its state and scores, and a sentence for every file that cannot be read."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 from pydantic import BaseModel, ConfigDict
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.validation import sentence, shown, validate
 from apex_lab.metrics import KEYS
-from apex_lab.metrics.order import natural_key
 
 MIN_SHARE, MAX_SHARE = 0.001, 0.999
 """A seed has failed whose objects are given less or more of the validation pixels (metrics.md section 3)."""
@@ -36,20 +36,12 @@ class Record(BaseModel):
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
 
     status: Literal["running", "paused", "finished", "failed"]
-    model: str | None
-    ablation: str | None = None
-    data: str | None
-    scale: str | None
-    experiment: str | None = None
-    tuned: str | None = None
+    format: int = 1
     seed: int
     reason: str | None = None
     outcome: str | None = None
-    started: str | None = None
-    overrides: tuple[str, ...] = ()
     fingerprint: str | None = None
     data_fingerprint: str | None = None
-    commit: str | None = None
     foreground_share: float | None = None
 
 
@@ -88,20 +80,6 @@ class SeedRun:
     share: float | None = None
 
     @property
-    def group(self) -> str:
-        """Name of the configuration's folder."""
-        return self.folder.parent.name
-
-    @property
-    def words(self) -> str | None:
-        """model[_ablation]_data_scale, from run.json, else from the folder's name; None where neither has it."""
-        if self.record is None:
-            named = re.fullmatch(r"(.+)_[0-9a-f]{8}", self.group)
-            return named.group(1) if named else None
-        record = self.record
-        return run_words(record.model, record.ablation, record.data, record.scale)
-
-    @property
     def failure(self) -> str | None:
         """Why this seed has failed by the rule of metrics.md section 3, which sees validation data alone; else None."""
         if self.state == "diverged":
@@ -111,38 +89,18 @@ class SeedRun:
         return None
 
 
-def run_words(model: str | None, ablation: str | None, data: str | None, scale: str | None) -> str:
-    """The words that name the folder of a run."""
-    return "_".join(word for word in (model, ablation, data, scale) if word)
+def read_run(folder: Path, seed: int, known: Mapping[str, Any] | None = None) -> SeedRun | None:
+    """Reads one run folder; damage becomes a state, never an exception. None where there is no folder.
 
-
-def collect(outputs: Path) -> list[SeedRun]:
-    """Every run in a folder, in the natural order of their names; none where the folder does not exist.
-
-    Raises:
-        UserError: the folder cannot be listed.
+    Args:
+        folder: of the run.
+        seed: its seed.
+        known: content of run.json, where it was read before.
     """
-    if not outputs.exists():
-        return []
+    if not known and not folder.exists():
+        return None
     try:
-        groups = [path for path in outputs.iterdir() if path.is_dir()]
-        folders = [(int(p.name[5:]), p) for g in groups for p in g.glob("seed_*") if _is_seed(p)]
-    except OSError as error:
-        raise UserError(
-            f"paths.outputs = {outputs} cannot be read ({error.strerror}): give a folder of runs."
-        ) from error
-    ordered = sorted(folders, key=lambda pair: (natural_key(pair[1].parent.name), pair[0]))
-    return [read_run(path, seed) for seed, path in ordered]
-
-
-def _is_seed(path: Path) -> bool:
-    return re.fullmatch(r"seed_(0|[1-9]\d*)", path.name) is not None and path.is_dir()
-
-
-def read_run(folder: Path, seed: int) -> SeedRun:
-    """Reads one run folder; damage becomes a state, never an exception."""
-    try:
-        record = _record(folder / "run.json", seed)
+        record = _record(folder / "run.json", seed, known)
     except UserError as error:
         return SeedRun(folder, seed, None, "damaged", str(error))
     if record.status != "finished":
@@ -191,10 +149,10 @@ def read_arrangement(run: SeedRun) -> dict[str, list[list[float]]] | None:
     return found
 
 
-def _record(file: Path, seed: int) -> Record:
-    if not file.is_file():
+def _record(file: Path, seed: int, known: Mapping[str, Any] | None) -> Record:
+    if not known and not file.is_file():
         raise UserError(f"{file} is missing: run the command of this run again.")
-    content = read_json(file)
+    content = known or read_json(file)
     try:
         record = validate(Record, content, "")
     except UserError as error:
@@ -216,7 +174,7 @@ def _finished(folder: Path, record: Record) -> SeedRun:
     file = folder / "metrics.json"
     if not file.is_file():
         raise UserError(f"{file} is missing: run the command of this run again.")
-    content = read_json(file)
+    content = _results(file)
     splits = content.get("splits")
     if not isinstance(splits, dict) or not splits:
         raise UserError(f"{file} has no 'splits': remove it and run the same command again.")
@@ -238,6 +196,40 @@ def _finished(folder: Path, record: Record) -> SeedRun:
         share = _number(validation.get("foreground_share"), file, "splits.val.foreground_share")
     known = share is not None and math.isfinite(share)
     return SeedRun(folder, record.seed, record, "finished", None, scores, protocol, share if known else None)
+
+
+class _Split(msgspec.Struct):
+    """What tables need of a split; the rows per video, which are nearly all of the file, are not even built."""
+
+    total: Any = msgspec.UNSET
+    videos: Any = msgspec.UNSET
+    frames: Any = msgspec.UNSET
+    settings: Any = msgspec.UNSET
+    foreground_share: Any = msgspec.UNSET
+    data_fingerprint: Any = msgspec.UNSET
+
+
+class _Results(msgspec.Struct):
+    """What tables need of metrics.json."""
+
+    splits: dict[str, _Split] | None = None
+    settings: Any = msgspec.UNSET
+
+
+_DECODER = msgspec.json.Decoder(_Results)
+
+
+def _results(file: Path) -> dict[str, Any]:
+    """Content of metrics.json without what tables do not need.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    try:
+        content: dict[str, Any] = msgspec.to_builtins(_DECODER.decode(file.read_bytes()))
+        return content
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return read_json(file)  # of another shape, with NaN, or damaged: told as everywhere
 
 
 def _scoring(scored: Mapping[str, Any], content: Mapping[str, Any]) -> str:
@@ -272,7 +264,7 @@ def _size(value: Any, file: Path, key: str) -> int | None:
     return value
 
 
-def listed(values: Sequence[object]) -> str:
+def and_list(values: Sequence[object]) -> str:
     """ "1", "1 and 2", "1, 2 and 3"."""
     words = [str(value) for value in values]
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -108,14 +108,15 @@ def _heading(column: Column, arrows: bool) -> str:
 
 
 def _label(line: Line) -> str:
-    return (line.latex or escape(line.label)) + ("*" if line.asterisk else "")
+    told = "".join(f", {word}" for word in line.configuration.told)
+    return (f"{line.latex}{escape(told)}" if line.latex else escape(line.label)) + ("*" if line.asterisk else "")
 
 
 def _entries(table: Built, line: Line, published: bool) -> list[str]:
     found = []
     for column in table.columns:
         if column.key == TRACKING:
-            found.append(r"\yes" if line.tracking else r"\no")
+            found.append({True: r"\yes", False: r"\no", None: "---"}[line.tracking])
             continue
         cell = line.cells[column.key]
         text = _ours(cell, table.decimals)

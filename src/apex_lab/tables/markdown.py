@@ -14,24 +14,19 @@ YES, NO = "✓", "✗"
 ARROWS = {"up": "↑", "down": "↓", None: ""}
 
 
-def document(tables: Sequence[Built], published: bool, commands: Sequence[Command], problems: Sequence[str]) -> str:
-    """All tables, the commands of missing runs, and files that belong to no row.
+def document(tables: Sequence[Built], published: bool, commands: Sequence[Command]) -> str:
+    """All tables, and the commands of missing runs.
 
     Args:
         tables: in their order.
         published: whether the paper's values stand beside ours.
         commands: what to type for missing runs.
-        problems: a sentence each.
     """
     parts = [table_text(table, published) for table in tables]
     if commands:
         width = max(len(command.text) for command in commands)
         lines = [f"{command.text:<{width}}  # {'; '.join(command.remarks)}" for command in commands]
         parts.append("## Missing runs\n\n" + "\n".join(["```bash", *lines, "```"]))
-    if problems:
-        parts.append(
-            "## Files that cannot be read and belong to no row\n\n" + "\n".join(f"- {text}" for text in problems)
-        )
     return "\n\n".join(parts) + "\n"
 
 
@@ -79,7 +74,7 @@ def _entries(table: Built, line: Line, published: bool) -> list[str]:
     found = []
     for column in table.columns:
         if column.key == TRACKING:
-            found.append(YES if line.tracking else NO)
+            found.append({True: YES, False: NO, None: MISSING}[line.tracking])
             continue
         cell = line.cells[column.key]
         text = ours(cell, table.decimals)

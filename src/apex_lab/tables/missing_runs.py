@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 from apex_lab.tables.build import Built
-from apex_lab.tables.choose import Choice, Group, Version, command_words
-from apex_lab.tables.found import run_words
-from apex_lab.tables.rows import Line, Options
+from apex_lab.tables.configurations import Configuration
+from apex_lab.tables.rows import Line
 
 TRAIN = "python -m apex_lab.train"
 ARRANGE = "python -m apex_lab.arrange"
 ABSENT = "not in this version"
+RETRY = "hydra.sweeper.retry_failed=true"
 
 
 @dataclass(frozen=True)
@@ -29,90 +29,87 @@ class Command:
 
 def missing_runs(
     tables: Sequence[Built],
-    choices: Mapping[tuple[str, str | None], Choice],
-    options: Options,
-    asked: Iterable[str],
-    version: Version,
-    outputs: str,
-    paths: Sequence[str],
+    words: Sequence[str] | None,
+    exclude_failed: Collection[str],
+    arrange: bool,
+    config_dir: str | None = None,
 ) -> list[Command]:
-    """The commands for everything that the tables lack, trainings first.
+    """The commands for everything that the tables lack: all of it at once, then row by row, trainings first.
 
     Args:
         tables: all of them.
-        choices: the runs of each row.
-        options: what was asked for.
-        asked: names of run folders that were asked for.
-        version: what this version can run.
-        outputs: folder of the runs.
-        paths: words of the command line for the folders of runs and data.
+        words: those that name the jobs, where all jobs are in the tables.
+        exclude_failed: models whose failed seeds do not count.
+        arrange: whether this version has the arrangement task.
+        config_dir: a further folder of configuration files.
     """
-    rows: dict[tuple[str, str | None], dict[str, Line]] = {}
+    options = ["--config-dir", config_dir] if config_dir else []
+    rows: dict[str, dict[str, Line]] = {}
     for table in tables:
         for line in table.lines:
-            rows.setdefault(line.row.run, {})[table.number] = line
+            rows.setdefault(line.configuration.name, {})[table.number] = line
+    found = [(_lacking(lines.values()), lines) for lines in rows.values()]
+    trainings = [_training(seeds, lines, options) for seeds, lines in found if seeds]
     commands = []
-    for row, lines in rows.items():
-        command = _training(row, lines, choices[row].group, options, set(asked), version, paths)
-        commands += [command] if command else []
+    if words is not None and len(trainings) > 1:
+        retry = any(_has_failed(lines, seeds) for seeds, lines in found)
+        text = _typed(TRAIN, [*words, *([RETRY] if retry else []), *options, "-m"])
+        commands = [Command(text, ("all that is missing",))]
+    commands += trainings
     for table in tables:
         if table.source == "arrangement":
             for line in table.lines:
-                commands += _arrangements(line, choices[line.row.run].group, options, version, table.number, outputs)
+                commands += _arrangements(line, exclude_failed, arrange, table.number)
     return commands
 
 
-def _training(
-    row: tuple[str, str | None],
-    lines: Mapping[str, Line],
-    group: Group | None,
-    options: Options,
-    asked: set[str],
-    version: Version,
-    paths: Sequence[str],
-) -> Command | None:
-    """The command that completes a row; None where nothing is missing."""
+def _lacking(lines: Iterable[Line]) -> list[int]:
+    """Seeds of a configuration that are to be run or resumed."""
+    seeds: set[int] = set()
+    for line in lines:
+        damaged = [seed for seed, run in line.configuration.runs.items() if run.state == "damaged"]
+        seeds |= {*line.missing, *line.unfinished, *damaged}
+    return sorted(seeds)
+
+
+def _has_failed(lines: dict[str, Line], seeds: Sequence[int]) -> bool:
+    """Whether one of the seeds failed, which a sweep does not try again unless asked to."""
+    runs = next(iter(lines.values())).configuration.runs
+    records = [runs[seed].record for seed in seeds if seed in runs]
+    return any(
+        record is not None and record.status == "failed" and record.outcome in (None, "failed") for record in records
+    )
+
+
+def _training(seeds: Sequence[int], lines: dict[str, Line], options: Sequence[str]) -> Command:
+    """The command that completes a row."""
     first = next(iter(lines.values()))
-    wanted = sorted({seed for line in lines.values() for seed in line.wanted})
-    damaged = [seed for seed, run in group.runs.items() if run.state == "damaged"] if group else []
-    seeds = sorted({*damaged, *(seed for line in lines.values() for seed in (*line.missing, *line.unfinished))})
-    remarks = [f"{first.label}, table{'s' if len(lines) > 1 else ''} {', '.join(lines)}"]
-    changes: tuple[str, ...] = ()
-    if group is not None and group.name in asked:
-        changes = group.changes
-    elif group is not None and group.changes and not group.current:
-        seeds = wanted
-        remarks.append("without the changed values")
-    elif group is not None and group.current is False:
-        remarks.append(f"its other seeds have another configuration; seed={_joined(wanted)} makes the whole row again")
-    if not seeds:
-        return None
-    if not version.has(*row):
-        remarks.append(ABSENT)
-    naming = command_words(*row, options.data, options.scale)
-    split = 1 if row[1] is None else 2
-    words = [*naming[:split], f"seed={_joined(seeds)}", *naming[split:], *changes, *paths]
-    return Command(_typed(TRAIN, [*words, *(["-m"] if len(seeds) > 1 else [])]), tuple(remarks))
+    several = len(seeds) > 1
+    words = _seeded(first.configuration, seeds)
+    retry = [RETRY] if several and _has_failed(lines, seeds) else []
+    remark = f"{first.label}, table{'s' if len(lines) > 1 else ''} {', '.join(lines)}"
+    return Command(_typed(TRAIN, [*words, *retry, *options, *(["-m"] if several else [])]), (remark,))
 
 
-def _arrangements(
-    line: Line, group: Group | None, options: Options, version: Version, number: str, outputs: str
-) -> list[Command]:
+def _seeded(configuration: Configuration, seeds: Sequence[int]) -> list[str]:
+    """The words of a configuration's jobs with other seeds."""
+    words = list(configuration.jobs[min(configuration.jobs)])
+    seed = f"seed={','.join(map(str, seeds))}"
+    if not any(word.startswith("seed=") for word in words):
+        return [*words, *([seed] if seeds != [0] else [])]
+    return [seed if word.startswith("seed=") else word for word in words]
+
+
+def _arrangements(line: Line, exclude_failed: Collection[str], arrange: bool, number: str) -> list[Command]:
     """One command per seed whose results of the arrangement task are missing."""
+    configuration = line.configuration
     lacking = len(line.wanted) - len(line.counted)
-    runs = group.runs if group else {}
-    useless = {seed for seed, run in runs.items() if run.failure and line.row.model in options.exclude_failed}
-    free = [seed for seed in dict.fromkeys([*line.wanted, *sorted(runs)]) if seed not in {*line.counted, *useless}]
-    name = group.name if group else f"{run_words(*line.row.run, options.data, options.scale)}_*"
-    remarks = [f"{line.label}, table {number}"]
-    if not version.arrange or not version.has(*line.row.run):
-        remarks.append(ABSENT)
-    words = [f"checkpoint={outputs}/{name}/seed_{seed}" for seed in free[: max(0, lacking)]]
-    return [Command(_typed(ARRANGE, [word]), tuple(remarks)) for word in words]
-
-
-def _joined(seeds: Iterable[int]) -> str:
-    return ",".join(str(seed) for seed in seeds)
+    useless = {s for s, run in configuration.runs.items() if run.failure and line.row.model in exclude_failed}
+    seeds = dict.fromkeys([*line.wanted, *configuration.seeds])
+    free = [seed for seed in seeds if seed not in {*line.counted, *useless}]
+    remarks = (f"{line.label}, table {number}", *(() if arrange else (ABSENT,)))
+    folders = [configuration.folders[seed] for seed in free[: max(0, lacking)]]
+    return [Command(_typed(ARRANGE, [f"checkpoint={folder}"]), remarks) for folder in folders]
 
 
 def _typed(program: str, words: Sequence[str]) -> str:

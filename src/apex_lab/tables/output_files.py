@@ -15,21 +15,21 @@ from apex_lab.tables.missing_runs import Command
 from apex_lab.tables.rows import DDOF, TRACKING, Cell, Line, Summary
 
 
-def as_json(tables: Sequence[Built], commands: Sequence[Command], problems: Sequence[str]) -> dict[str, Any]:
+def as_json(tables: Sequence[Built], commands: Sequence[Command]) -> dict[str, Any]:
     """Everything the tables hold.
 
     Returns:
         `ddof`; `tables`, each with `number`, `caption`, `columns`, `rows`, `footnotes` and `notes`; `commands` with
-        `text` and `remarks`; `problems`. A row has `label`, `model`, `ablation`, `group` (folder of its runs), `seeds`
-        (lists and reasons under the names of `rows.Line`) and `cells`. A cell has `mean`, `std` and `n` over the seeds
-        that count, the same under `over_all_seeds`, `per_seed` (all seeds with results; for the arrangement task a mean
-        over scenarios), `values` (arrangement alone: all scenarios), `published` and `best`. Undefined values are null.
+        `text` and `remarks`. A row has `label`, `model`, `ablation`, `data`, `scale`, `changes` (further
+        words that make its configuration), `group` (folder of its runs), `seeds` (lists and reasons under the names of
+        `rows.Line`) and `cells`. A cell has `mean`, `std` and `n` over the seeds that count, the same under
+        `over_all_seeds`, `per_seed` (all seeds with results; for the arrangement task a mean over scenarios), `values`
+        (arrangement alone: all scenarios), `published` and `best`. Undefined values are null.
     """
     return {
         "ddof": DDOF,
         "tables": [_table(table) for table in tables],
         "commands": [{"text": command.text, "remarks": list(command.remarks)} for command in commands],
-        "problems": list(problems),
     }
 
 
@@ -51,7 +51,10 @@ def _row(table: Built, line: Line) -> dict[str, Any]:
         "model": line.row.model,
         "ablation": line.row.ablation,
         "tracking": line.tracking,
-        "group": line.group,
+        "data": line.configuration.data,
+        "scale": line.configuration.scale,
+        "changes": list(line.configuration.changes),
+        "group": line.configuration.folder,
         "data_fingerprint": protocol.data_fingerprint if protocol else None,
         "videos": protocol.videos if protocol else None,
         "frames": protocol.frames if protocol else None,
@@ -114,9 +117,9 @@ def _published(column: Column, cell: Cell) -> dict[str, Any] | None:
 def as_csv(table: Built) -> str:
     """A table as CSV, a line per row and column; empty fields where there is no value.
 
-    Columns: `row`, `model`, `ablation`, `group`, `column`, `key`, `better`, `mean`, `std`, `n`, `ddof`, `text` (as
-    printed), `best`, `published_mean`, `published_std`, `published_as`, `counted_seeds`, `excluded_seeds`,
-    `failed_seeds` (numbers with spaces between), and `seed_<n>` for every seed with results.
+    Columns: `row`, `model`, `ablation`, `data`, `scale`, `changes`, `group`, `column`, `key`, `better`, `mean`, `std`,
+    `n`, `ddof`, `text` (as printed), `best`, `published_mean`, `published_std`, `published_as`, `counted_seeds`,
+    `excluded_seeds`, `failed_seeds` (numbers with spaces between), and `seed_<n>` for every seed with results.
     """
     rows = [(line, column, line.cells[column.key]) for line in table.lines for column in table.columns if column.better]
     seeds = sorted({seed for _, _, cell in rows for seed in cell.values})
@@ -129,7 +132,10 @@ def as_csv(table: Built) -> str:
                 "row": label(line),
                 "model": line.row.model,
                 "ablation": line.row.ablation,
-                "group": line.group,
+                "data": line.configuration.data,
+                "scale": line.configuration.scale,
+                "changes": " ".join(line.configuration.changes),
+                "group": line.configuration.folder,
                 "column": column.label,
                 "key": column.key,
                 "better": column.better,

@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 
 from apex_lab.base.errors import UserError
-from apex_lab.tables.choose import Choice
+from apex_lab.tables.configurations import DATA, Configuration
 from apex_lab.tables.definition import Column, Published, Row, Specification, Table
-from apex_lab.tables.found import Protocol, SeedRun, listed, read_arrangement
+from apex_lab.tables.found import Protocol, SeedRun, and_list, read_arrangement
 
 DDOF = 1
 """Seeds are a sample: deviations divide by n - 1 (metrics.md section 3)."""
@@ -25,9 +25,6 @@ TRACKING = "tracking"
 class Options:
     """What is asked for; see conf/tables.yaml."""
 
-    data: str
-    scale: str
-    seeds: tuple[int, ...]
     exclude_failed: Collection[str]
     published: bool
     yardsticks: bool
@@ -83,17 +80,19 @@ class Line:
 
     Attributes:
         row: its specification.
-        label, latex: its name, without an asterisk.
+        configuration: what was run.
+        name: what the paper calls it.
+        label: its name, without an asterisk; what differs from the paper's data, scale and settings is in it.
+        latex: the name in LaTeX, where that differs, without what differs.
         asterisk: whether a footnote marked * belongs to it.
-        tracking: whether its components keep identities.
-        group: folder of its runs, None where there are none.
+        tracking: whether its components keep identities; None where nothing tells.
         counted: seeds in the means.
         excluded: seed -> why it does not count though it may have results (failed-seed rule).
         failed: seed -> why it has no results: failed by the rule, or damaged.
         unfinished: seed -> the reason in its record.
         left_out: seed -> why its results cannot stand beside the others.
         missing: seeds that were never started.
-        wanted: seeds that are asked for.
+        wanted: seeds of its jobs that the table needs.
         candidate: whether it competes for bold.
         protocol: of its scores.
         cells: key of the column -> entry.
@@ -101,11 +100,12 @@ class Line:
     """
 
     row: Row
+    configuration: Configuration
+    name: str
     label: str
     latex: str | None
     asterisk: bool
-    tracking: bool
-    group: str | None
+    tracking: bool | None
     counted: tuple[int, ...]
     excluded: dict[int, str]
     failed: dict[int, str]
@@ -135,7 +135,12 @@ class _Content:
 
 
 def make_line(
-    row: Row, candidate: bool, table: Table, specification: Specification, choice: Choice, options: Options
+    row: Row,
+    candidate: bool,
+    table: Table,
+    specification: Specification,
+    configuration: Configuration,
+    options: Options,
 ) -> Line:
     """Fills a row.
 
@@ -144,15 +149,13 @@ def make_line(
         candidate: whether its section competes for bold.
         table: where it stands.
         specification: of the table.
-        choice: its runs.
+        configuration: what was run, with its runs.
         options: of the command.
     """
-    group, model = choice.group, specification.models[row.model]
-    trained = group.runs if group else {}
-    content = _content(trained, table, options)
-    wanted = model.seeds or table.seeds or options.seeds
+    content = _content(configuration.runs, table, options)
+    wanted = tuple(seed for seed in table.seeds or () if seed in configuration.seeds) or configuration.seeds
     arranged = {*content.results, *content.faults, *wanted}
-    runs = {seed: run for seed, run in trained.items() if table.source == "metrics" or seed in arranged}
+    runs = {s: run for s, run in configuration.runs.items() if table.source == "metrics" or s in arranged}
     listed_for_exclusion = row.model in options.exclude_failed
     excluded = {seed: run.failure for seed, run in runs.items() if run.failure and listed_for_exclusion}
     failed = {
@@ -161,18 +164,18 @@ def make_line(
         if (why := _fault(run, content.faults.get(seed))) is not None and seed not in excluded
     }
     unfinished = {seed: run.why or "" for seed, run in runs.items() if run.state == "unfinished"}
-    left_out = group.left_out if group else {}
+    left_out = dict(configuration.left_out)
     counted = tuple(sorted(seed for seed in content.results if seed not in excluded))
-    open_places = max(0, len(wanted) - len(trained))
-    missing = tuple(seed for seed in wanted if seed not in {*trained, *left_out})[:open_places]
+    missing = tuple(seed for seed in wanted if seed not in {*configuration.runs, *left_out})
+    if configuration.data != DATA:  # what the paper says of its own data
+        row = row.model_copy(update={"published": {}, "published_excluded": 0, "fails": False})
     columns = [column for column in table.columns if column.key != TRACKING]
     cells = {column.key: _cell(row, column, content.results, counted) for column in columns}
     notes = [
-        *choice.notes,
+        *(f"seed {seed} is left out: {why}" for seed, why in sorted(left_out.items())),
         *(f"seed {seed} failed: {why}" for seed, why in sorted({**failed, **({} if counted else excluded)}.items())),
         *(f"seed {seed} is not finished: {why}" for seed, why in sorted(unfinished.items())),
         *_failures_that_count(runs, counted),
-        *_seeds_unlike(wanted, counted),
         *_undefined(columns, cells, counted),
         *_unexpected(row, columns, content.results, counted),
     ]
@@ -180,11 +183,12 @@ def make_line(
         notes += _unchecked(runs)
     return Line(
         row=row,
-        label=specification.label(row),
+        configuration=configuration,
+        name=specification.label(row),
+        label=", ".join([specification.label(row), *configuration.told]),
         latex=specification.latex(row),
         asterisk=row.fails or bool(excluded and counted) or (options.published and row.published_excluded > 0),
-        tracking=model.tracking,
-        group=group.name if group else None,
+        tracking=_tracks(row.model, specification, runs),
         counted=counted,
         excluded={seed: str(why) for seed, why in excluded.items()},
         failed=failed,
@@ -193,10 +197,18 @@ def make_line(
         missing=missing,
         wanted=wanted,
         candidate=candidate and not row.fails,
-        protocol=group.protocol if group and counted and table.source == "metrics" else None,
+        protocol=configuration.protocol if counted and table.source == "metrics" else None,
         cells=cells,
         notes=tuple(notes),
     )
+
+
+def _tracks(model: str, specification: Specification, runs: Mapping[int, SeedRun]) -> bool | None:
+    """Whether components keep identities: as the tables say, else whether there are scores of tracking."""
+    if model in specification.models:
+        return specification.models[model].tracking
+    scored = [run.scores for run in runs.values() if "mota" in run.scores]
+    return any(math.isfinite(scores["mota"]) for scores in scored) if scored else None
 
 
 def _content(runs: Mapping[int, SeedRun], table: Table, options: Options) -> _Content:
@@ -259,14 +271,9 @@ def _unchecked(runs: Mapping[int, SeedRun]) -> list[str]:
     if not unknown:
         return []
     return [
-        f"run.json of seed{'s' if len(unknown) > 1 else ''} {listed(unknown)} has no foreground_share, "
+        f"run.json of seed{'s' if len(unknown) > 1 else ''} {and_list(unknown)} has no foreground_share, "
         "so the failed-seed rule saw the loss alone: evaluate with split=val."
     ]
-
-
-def _seeds_unlike(wanted: Sequence[int], counted: Sequence[int]) -> list[str]:
-    other = [seed for seed in counted if seed not in wanted]
-    return [f"mean over the seeds {listed(counted)}."] if other else []
 
 
 def _undefined(columns: Sequence[Column], cells: Mapping[str, Cell], counted: Sequence[int]) -> list[str]:
@@ -277,9 +284,11 @@ def _undefined(columns: Sequence[Column], cells: Mapping[str, Cell], counted: Se
         lacking = [seed for seed in counted if seed not in values]
         nowhere = [seed for seed in counted if any(not math.isfinite(value) for value in values.get(seed, ()))]
         if lacking:
-            notes.append(f"the results of seed {listed(lacking)} have no {column.label} ({column.key}).")
+            notes.append(f"the results of seed {and_list(lacking)} have no {column.label} ({column.key}).")
         if nowhere:
-            notes.append(f"{column.label} is undefined (n/a) in seed {listed(nowhere)} and left out of the mean there.")
+            notes.append(
+                f"{column.label} is undefined (n/a) in seed {and_list(nowhere)} and left out of the mean there."
+            )
     return notes
 
 

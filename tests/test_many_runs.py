@@ -1,0 +1,90 @@
+"""`status` and `tables` of many runs: every file is read once, and 2,000 finished runs take less than five seconds."""
+
+from __future__ import annotations
+
+import json
+import resource
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from apex_lab.runs.listed import listed
+from tests.conftest import Ended
+from tests.tables.folders import SCORES
+
+VIDEOS = 200
+"""Rows per video in every result, as at the paper's scale; they make nearly all of the file."""
+
+
+def finished_runs(outputs: Path, words: list[str], videos: int) -> int:
+    """Writes the finished run of every job of a command line; how many."""
+    scores = {f"{key}_{number}": 0.123456789012345 for key in SCORES for number in range(3)}
+    rows = [{"video": f"test_{number:05d}", **scores} for number in range(videos)]
+    split = {"videos": videos, "frames": 20 * videos, "total": {"videos": videos, **SCORES}, "per_video": rows}
+    results = json.dumps({"settings": {"scoring": {}}, "versions": {}, "splits": {"test": split}}, indent=2)
+    jobs = listed([*words, f"paths.outputs={outputs}"])
+    for job in jobs:
+        job.folder.mkdir(parents=True)
+        about: dict[str, Any] = {
+            "format": 2,
+            "status": "finished",
+            "outcome": "finished",
+            "seed": job.seed,
+            "steps": 40_000,
+            "seconds": 9000.0,
+            "fingerprint": job.fingerprint,
+            "data_fingerprint": "d" * 32,
+            "foreground_share": 0.3,
+            "versions": {f"package_{number}": "1.2.3" for number in range(15)},
+            "history": [{"started": "2026-01-01T00:00:00+00:00", "command": " ".join(job.words)}],
+        }
+        (job.folder / "run.json").write_text(json.dumps(about, indent=2))
+        (job.folder / "metrics.json").write_text(results)
+    return len(jobs)
+
+
+def test_every_file_is_read_once(
+    command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["+sweep=arrangement", "model=apex,oracle", "scale=smoke", "seed=range(0,5)"]
+    assert finished_runs(tmp_path / "outputs", words, videos=1) == 10
+    reads: Counter[str] = Counter()
+    for name in ("read_text", "read_bytes"):
+        method = getattr(Path, name)
+
+        def counted(path: Path, *rest: Any, _method: Any = method, **named: Any) -> Any:
+            reads.update([path.name])
+            return _method(path, *rest, **named)
+
+        monkeypatch.setattr(Path, name, counted)
+    ended = command("status", *words, "--once")
+    assert "10 jobs: 10 finished." in ended.out
+    assert (reads["run.json"], reads["metrics.json"]) == (10, 0)
+    reads.clear()
+    ended = command("tables", *words, "tables=[1]", "dry_run=true")
+    assert ended.code == 0
+    assert (reads["run.json"], reads["metrics.json"]) == (10, 10)
+    reads.clear()
+    assert "10 jobs: 10 finished." in command("status", "--once").out
+    assert (reads["run.json"], reads["metrics.json"], reads["config.yaml"]) == (10, 0, 0)
+
+
+@pytest.mark.slow
+def test_two_thousand_runs_take_less_than_five_seconds(tmp_path: Path) -> None:
+    words = ["+sweep=paper", "seed=range(0,134)"]
+    assert finished_runs(tmp_path / "outputs", words, VIDEOS) == 2010
+    for asked in (["status", *words, "--once"], ["status", "--once"], ["tables", *words]):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        program = [sys.executable, "-m", f"apex_lab.{asked[0]}", *asked[1:]]
+        ended = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        assert ended.returncode == 0, ended.stderr
+        # processor time: what an idle machine takes, whatever else this one is doing
+        seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+        print(f"{' '.join(asked)}: {seconds:.1f} s")
+        assert seconds < 5.0, asked
