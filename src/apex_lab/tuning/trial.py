@@ -46,6 +46,7 @@ class Watch(L.Callback):
     def __init__(self, trial: optuna.Trial, name: str, before: list[float], max_steps: int) -> None:
         self._trial, self._name, self._before = trial, name, before
         self._max_steps = max_steps
+        self._hopeless: str | None = None
 
     def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
@@ -57,9 +58,13 @@ class Watch(L.Callback):
         mean = math.fsum([*self._before, score]) / (len(self._before) + 1)
         step = len(self._before) * self._max_steps + learner.step
         self._trial.report(mean, step)
-        last = learner.step >= self._max_steps  # nothing is left to save
-        if not last and self._trial.should_prune():
-            raise Pruned(f"pruned at step {learner.step}: {self._name} {mean:.4g} promises less than earlier trials")
+        if learner.step < self._max_steps and self._trial.should_prune():  # at the last step nothing is left to save
+            self._hopeless = f"pruned at step {learner.step}: {self._name} {mean:.4g} promises less than earlier trials"
+
+    def on_train_batch_start(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
+        """Ends the run here, where the checkpoint of the validation is stored."""
+        if self._hopeless is not None:
+            raise Pruned(self._hopeless)
 
 
 def score_of(name: str, scores: Mapping[str, Any], terms: Mapping[str, Any]) -> float | None:
