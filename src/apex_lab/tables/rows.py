@@ -7,8 +7,6 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-
 from apex_lab.base.errors import UserError
 from apex_lab.tables.configurations import DATA, Configuration
 from apex_lab.tables.definition import Column, Published, Row, Specification, Table
@@ -42,11 +40,13 @@ class Summary:
 
 def summarise(values: Iterable[float]) -> Summary:
     """Mean and sample deviation of those values that are finite."""
-    finite = np.array([value for value in values if math.isfinite(value)], dtype=np.float64)
-    if finite.size == 0:
+    finite = [value for value in values if math.isfinite(value)]
+    if not finite:
         return Summary(0, math.nan, None)
-    std = float(finite.std(ddof=DDOF)) if finite.size > DDOF else None
-    return Summary(int(finite.size), float(finite.mean()), std)
+    mean = math.fsum(finite) / len(finite)
+    squares = math.fsum((value - mean) ** 2 for value in finite)
+    std = math.sqrt(squares / (len(finite) - DDOF)) if len(finite) > DDOF else None
+    return Summary(len(finite), mean, std)
 
 
 def rounded(value: float, decimals: int) -> str:
