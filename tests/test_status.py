@@ -125,7 +125,7 @@ def rendered(jobs: list[Listed], width: int, most: int | None = None) -> str:
 def test_the_table_fits_a_narrow_terminal(jobs: list[Listed]) -> None:
     text = rendered(jobs, 80)
     assert max(map(len, text.splitlines())) <= 80
-    rows = [row.split() for row in text.splitlines()[1:7]]
+    rows = [row.split() for row in text.splitlines()[4:10]]
     name = jobs[0].name
     assert rows[0] == [name, "0", "finished", "100"]
     assert rows[1] == [name, "1", "running", "40/100", "4.5", "minutes"]
@@ -146,7 +146,7 @@ def test_a_terminal_of_few_lines_shows_what_is_going_on(jobs: list[Listed]) -> N
 def test_seeds_that_wait_share_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     text = rendered([job.again() for job in composed()], 80)
-    assert [row.split()[1:3] for row in text.splitlines()[1:2]] == [["0-5", "waiting"]]
+    assert [row.split()[1:3] for row in text.splitlines() if "_smoke_" in row] == [["0-5", "waiting"]]
 
 
 @pytest.fixture

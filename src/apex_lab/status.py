@@ -101,7 +101,7 @@ def watch(look: Callable[[], Overview], console: Console) -> None:
 
 
 def drawn(seen: Overview, most: int | None = None) -> RenderableType:
-    """The jobs as a table with a line of sums below.
+    """The sums, which a small terminal shows too, and the jobs as a table.
 
     Args:
         seen: what to draw.
@@ -132,7 +132,7 @@ def drawn(seen: Overview, most: int | None = None) -> RenderableType:
     parts: list[RenderableType] = [table, *_reasons(lines)]
     if hidden:
         parts.append(Text(f"... {hidden} more lines; --once prints all", style="dim"))
-    return Group(*parts, Text(), Text(summary(seen)))
+    return Group(Text(summary(seen)), Text(), *parts)
 
 
 def summary(seen: Overview) -> str:
