@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from apex_lab.base.errors import UserError
-
 STRIP, MOVIE = Path("view") / "film_strip.png", Path("view") / "movie.mp4"
 """Where a run's pictures lie in its folder."""
 
@@ -103,14 +101,3 @@ def _boxes(content: bytes) -> Iterator[tuple[bytes, bytes]]:
         if name in (b"moov", b"trak"):
             yield from _boxes(inside)
         at += length
-
-
-def budget(megabytes: float) -> Budget:
-    """A budget of so many megabytes.
-
-    Raises:
-        UserError: it is negative.
-    """
-    if megabytes < 0:
-        raise UserError(f"megabytes = {megabytes:g} is wrong: it must be at least 0; 0 leaves all pictures out.")
-    return Budget(int(megabytes * MEGABYTE))
