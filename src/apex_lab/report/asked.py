@@ -1,9 +1,12 @@
 """A report of runs as one HTML file: tables beside the paper's, curves, pictures, settings, versions, failures.
 
-python -m apex_lab.report +sweep=ablations scale=cpu
+python -m apex_lab.report +sweep=ablations scale=cpu    the runs of a sweep
 python -m apex_lab.report model=apex,space seed=0,1 scale=cpu megabytes=50 folder=report
 
-Own keys (conf/report.yaml): folder=, videos=, megabytes=. All other words are those of apex_lab.train and name the runs.
+python -m apex_lab.report                               all runs of +sweep=paper
+
+Own keys: folder=, videos=, megabytes= (conf/report.yaml), and tables=, exclude_failed=, published=, yardsticks=,
+arrangement_mean= (conf/tables.yaml). All other words are those of apex_lab.train and name the runs.
 """
 
 from __future__ import annotations
@@ -13,8 +16,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -22,7 +26,8 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_text
 from apex_lab.base.validation import sentence, validate
-from apex_lab.config.composition import conf_dir
+from apex_lab.config import command_line as cli
+from apex_lab.config.composition import CHOICES, composing, conf_dir, plain
 from apex_lab.config.reader import Reader, ending
 from apex_lab.report.assemble import Asked, assemble
 from apex_lab.report.contents import size_text
@@ -30,9 +35,15 @@ from apex_lab.report.page import render
 from apex_lab.runs import provenance
 from apex_lab.runs.listed import listed
 from apex_lab.tables import definition
-from apex_lab.tables.asked import read_tables
+from apex_lab.tables.asked import EVERYTHING, Tables, TablesConfig
 
 FILE = "report.html"
+
+NAMING = ("sweep", *(group for group in CHOICES if group not in ("data", "scale")))
+"""Words that say which models a report is of; without any it is of `EVERYTHING`."""
+
+NOT_OF_TABLES = ("folder", "dry_run")
+"""Keys of the tables' command that a report has not, or means itself."""
 
 
 class ReportConfig(BaseModel):
@@ -50,7 +61,8 @@ def main() -> None:
     reader = Reader("report", __doc__ or "")
     with ending():
         asked = reader.asked()
-        console.say(str(write(asked.words, asked.config_dir)))
+        path = write(asked.words, asked.config_dir)
+        console.say(f"{path} ({size_text(path)})")
 
 
 def write(words: Sequence[str], config_dir: str | None = None) -> Path:
@@ -61,47 +73,73 @@ def write(words: Sequence[str], config_dir: str | None = None) -> Path:
         config_dir: a further folder of configuration files.
 
     Raises:
-        UserError: wrong words, no words, or a file that cannot be read or written; one sentence.
+        UserError: wrong words, or a file that cannot be written; one sentence.
     """
-    own, rest = split(words)
-    if all(word.lstrip("+").startswith("paths.") for word in rest):
-        raise UserError("Name the runs: +sweep=<name>, or words of apex_lab.train such as model=apex seed=0,1.")
+    own, of_tables, rest = split(words)
+    if not any(_key(word) in NAMING for word in rest):
+        rest = [EVERYTHING, *rest]
+    settings = tables_settings(of_tables)
     jobs = listed(rest, config_dir)
-    tables = read_tables(rest, config_dir)
-    asked = Asked(rest, words, own.videos, own.megabytes)
-    report = assemble(asked, jobs, tables.tables, definition.load(), provenance.commit()[0])
-    page = render(report)
+    numbers = settings.tables or cli.sweep_tables(rest, config_dir)
+    asked_tables = Tables(
+        asked=settings,
+        words=tuple(rest),
+        jobs=tuple(jobs),
+        numbers=None if numbers is None else tuple(numbers),
+        specification=definition.load(),
+        config_dir=config_dir,
+    )
+    report = assemble(Asked(rest, words, own.videos, own.megabytes), asked_tables, provenance.commit()[0])
     outputs = Path(jobs[0].raw["paths"]["outputs"])
-    path = make_folder(Path(own.folder) if own.folder else outputs / "reports" / slug(rest)) / FILE
-    write_text(path, page)
-    console.say(f"{len(jobs)} runs, {size_text(path)}")
+    path = (Path(own.folder) if own.folder else outputs / "reports" / slug(rest)) / FILE
+    make_folder(path.parent)
+    write_text(path, render(report))
     return path
 
 
-def split(words: Sequence[str]) -> tuple[ReportConfig, list[str]]:
-    """The report's own keys, and all other words.
+def split(words: Sequence[str]) -> tuple[ReportConfig, list[str], list[str]]:
+    """The report's own keys, words that are keys of the tables, and all others.
 
     Raises:
         UserError: a key with an impossible value.
     """
     values: dict[str, Any] = OmegaConf.to_container(OmegaConf.load(conf_dir() / "report.yaml"))  # type: ignore[assignment]
-    rest = []
+    of_tables, rest = [], []
     for word in words:
         key = word.partition("=")[0]
-        if key not in ReportConfig.model_fields:
+        if key in ReportConfig.model_fields:
+            try:
+                values[key] = OverridesParser.create().parse_override(word).value()
+            except HydraException as error:
+                text = str(error).splitlines()[0]
+                raise UserError(sentence(f"'{word}' cannot be read as key=value: {text}")) from error
+        elif key in TablesConfig.model_fields and key not in NOT_OF_TABLES:
+            of_tables.append(word)
+        else:
             rest.append(word)
-            continue
-        try:
-            values[key] = OverridesParser.create().parse_override(word).value()
-        except OverrideParseException as error:
-            raise UserError(sentence(f"'{word}' cannot be read as key=value: {str(error).splitlines()[0]}")) from error
     checked = validate(ReportConfig, values, "")
     assert isinstance(checked, ReportConfig)
-    return checked, rest
+    return checked, of_tables, rest
+
+
+def tables_settings(words: Sequence[str]) -> TablesConfig:
+    """The keys of conf/tables.yaml with those that the command sets.
+
+    Raises:
+        UserError: an impossible value.
+    """
+    with composing(words):
+        settings = validate(TablesConfig, plain(compose("tables", overrides=list(words))), "")
+    assert isinstance(settings, TablesConfig)
+    return settings
+
+
+def _key(word: str) -> str:
+    return word.partition("=")[0].lstrip("+~")
 
 
 def slug(words: Sequence[str]) -> str:
     """The words as the name of a folder, those about folders left out."""
     named = [word.lstrip("+").removeprefix("sweep=") for word in words if not word.lstrip("+").startswith("paths.")]
-    text = re.sub(r"[^A-Za-z0-9.,=-]+", "-", "_".join(named)).strip("-.")
+    text = re.sub(r"[^\w.,=-]+", "-", "_".join(named)).strip("-.")
     return text[:100] or "runs"

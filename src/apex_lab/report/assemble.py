@@ -9,14 +9,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import apex_lab
+from apex_lab.base.errors import UserError
 from apex_lab.report import contents
 from apex_lab.report.contents import Configuration, Seed, typed
 from apex_lab.report.page import Made, Missing, Report
 from apex_lab.report.pictures import MEGABYTE, MOVIE, STRIP, Budget
 from apex_lab.report.tables import views
 from apex_lab.runs.listed import Listed
-from apex_lab.tables.build import Built
+from apex_lab.tables.asked import Made as MadeTables
+from apex_lab.tables.asked import Tables
+from apex_lab.tables.asked import assemble as make_tables
 from apex_lab.tables.definition import Specification
+from apex_lab.tables.missing_runs import ARRANGE, Command
 
 TASK = ("data", "scale")
 """Groups that a label names only where a report has several of them."""
@@ -38,23 +42,20 @@ class Asked(NamedTuple):
     megabytes: float
 
 
-def assemble(
-    asked: Asked,
-    jobs: Sequence[Listed],
-    tables: Sequence[Built],
-    specification: Specification,
-    commit: str | None,
-) -> Report:
+def assemble(asked: Asked, tables: Tables, commit: str | None) -> Report:
     """Everything on the page.
 
     Args:
         asked: by the command.
-        jobs: at least one.
-        tables: made from these jobs.
-        specification: the tables' names of models and ablations.
+        tables: its jobs, at least one, and how tables are made from them.
         commit: of the code that makes the report.
     """
-    rows = configurations(jobs, specification)
+    jobs = tables.jobs
+    rows = configurations(jobs, tables.specification)
+    try:
+        made_tables, no_tables = make_tables(tables), None
+    except UserError as error:  # the jobs have no row in a table; all else is there to be shown
+        made_tables, no_tables = MadeTables((), ()), str(error)
     budget = Budget(int(asked.megabytes * MEGABYTE))
     panels, curve_remarks = contents.panels(rows)
     pictures = contents.pictures(rows, budget, asked.movies)
@@ -73,11 +74,12 @@ def assemble(
         title=title(asked.words),
         made=made,
         configurations=rows,
-        tables=views(tables, [one.choices.get("scale", "") for one in rows]),
+        tables=views(made_tables.tables, [one.choices.get("scale", "") for one in rows]),
+        no_tables=no_tables,
         panels=panels,
         pictures=pictures,
         settings=settings,
-        missing=missing(rows, jobs),
+        missing=[*missing(rows, jobs), *_arrangements(made_tables.commands)],
         limit=_limit(asked),
         warnings=warnings(rows),
         curve_remarks=curve_remarks,
@@ -175,6 +177,15 @@ def missing(rows: Sequence[Configuration], jobs: Sequence[Listed]) -> list[Missi
                 text = f"seed{'s' if len(seeds) > 1 else ''} {contents.ranges(seeds)} {what}"
                 found.append(Missing(row.label, text, typed(reseeded(words[row.name], seeds))))
     return found
+
+
+def _arrangements(commands: Sequence[Command]) -> list[Missing]:
+    """Those commands of the tables that train nothing."""
+    return [
+        Missing(one.remarks[0], "; ".join(["arrangement task", *one.remarks[1:]]), one.text)
+        for one in commands
+        if one.text.startswith(ARRANGE)
+    ]
 
 
 def reseeded(words: Sequence[str], seeds: Sequence[int]) -> list[str]:

@@ -73,6 +73,7 @@ class Report:
     settings: Sequence[Settings]
     missing: Sequence[Missing]
     limit: str
+    no_tables: str | None = None
     warnings: Sequence[str] = ()
     curve_remarks: Sequence[str] = ()
     setting_remarks: Sequence[str] = ()
