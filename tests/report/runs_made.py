@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import math
 import random
 from collections.abc import Sequence
@@ -12,13 +13,21 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
-from apex_lab.base.files import write_json
 from apex_lab.config.upgrades import FORMAT
 from apex_lab.report.pictures import MOVIE, STRIP
 from apex_lab.runs.listed import Listed
 
 SCORES = {"ari_fg": 0.8, "msc_fg": 0.7, "ari": 0.9, "msc": 0.75}
-SCORES |= {"mota": 50.0, "motp": 80.0, "match": 75.0, "id_switches": 1.0, "fps": 30.0, "misses": 20.0, "md": 70.0, "mt": 71.0}
+SCORES |= {
+    "mota": 50.0,
+    "motp": 80.0,
+    "match": 75.0,
+    "id_switches": 1.0,
+    "fps": 30.0,
+    "misses": 20.0,
+    "md": 70.0,
+    "mt": 71.0,
+}
 
 
 def made(job: Listed, status: str = "finished", reason: str | None = None, **more: Any) -> None:
@@ -33,7 +42,7 @@ def made(job: Listed, status: str = "finished", reason: str | None = None, **mor
     draw = random.Random(f"{job.name}{job.seed}")
     folder, steps = job.folder, 200
     folder.mkdir(parents=True)
-    write_json(
+    _json(
         folder / "run.json",
         {
             "format": FORMAT,
@@ -61,7 +70,11 @@ def made(job: Listed, status: str = "finished", reason: str | None = None, **mor
         total = {key: value * draw.uniform(0.9, 1.1) for key, value in SCORES.items()}
         total |= {f"{key}_start2": total[key] for key in SCORES if key not in ("ari_fg", "msc_fg", "ari", "msc")}
         split = {"videos": 20, "frames": 100, "data_fingerprint": "d1d2d3d4", "settings": {}, "total": total}
-        write_json(folder / "metrics.json", {"splits": {"test": split}})
+        _json(folder / "metrics.json", {"splits": {"test": split}})
+
+
+def _json(file: Path, content: object) -> None:
+    file.write_text(json.dumps(content))
 
 
 def curves(file: Path, steps: Sequence[int], draw: random.Random) -> None:

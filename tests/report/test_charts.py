@@ -75,7 +75,15 @@ def test_ticks_are_round(low: float, high: float, expected: list[float]) -> None
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0, "0"), (0.8234, "0.823"), (-1250, "−1250"), (40000, "40k"), (-1.25e6, "−1.25M"), (3e-5, "3e−05"), (2e10, "20G")],
+    [
+        (0, "0"),
+        (0.8234, "0.823"),
+        (-1250, "−1250"),
+        (40000, "40k"),
+        (-1.25e6, "−1.25M"),
+        (3e-5, "3e−05"),
+        (2e10, "20G"),
+    ],
 )
 def test_numbers_are_short(value: float, text: str) -> None:
     assert short(value) == text

@@ -7,8 +7,20 @@ from apex_lab.report.settings import Setting, compared, flat
 
 
 def test_keys_are_those_of_the_command_line() -> None:
-    raw = {"seed": 3, "paths": {"data": "x"}, "model": {"a": {"b": 1e-3, "c": None}, "on": True}, "callbacks": {}, "l": [1, 2]}
-    assert flat(raw) == {"model.a.b": "0.001", "model.a.c": "null", "model.on": "true", "callbacks": "{}", "l": "[1, 2]"}
+    raw = {
+        "seed": 3,
+        "paths": {"data": "x"},
+        "model": {"a": {"b": 1e-3, "c": None}, "on": True},
+        "callbacks": {},
+        "l": [1, 2],
+    }
+    assert flat(raw) == {
+        "model.a.b": "0.001",
+        "model.a.c": "null",
+        "model.on": "true",
+        "callbacks": "{}",
+        "l": "[1, 2]",
+    }
 
 
 def test_differences_go_both_ways() -> None:

@@ -80,12 +80,15 @@ def write(words: Sequence[str], config_dir: str | None = None) -> Path:
         rest = [EVERYTHING, *rest]
     settings = tables_settings(of_tables)
     jobs = listed(rest, config_dir)
-    numbers = settings.tables or cli.sweep_tables(rest, config_dir)
+    numbers = settings.tables
+    if numbers is None and any(_key(word) == "sweep" for word in rest):
+        found = cli.sweep_tables(rest, config_dir)
+        numbers = None if found is None else tuple(found)
     asked_tables = Tables(
         asked=settings,
         words=tuple(rest),
         jobs=tuple(jobs),
-        numbers=None if numbers is None else tuple(numbers),
+        numbers=numbers,
         specification=definition.load(),
         config_dir=config_dir,
     )

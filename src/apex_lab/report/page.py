@@ -138,9 +138,7 @@ def _overview(configurations: Sequence[Configuration]) -> dict[str, Any]:
                 "finished": len(one.finished),
                 "jobs": len(one.seeds),
                 "hours": one.hours,
-                "states": [
-                    (state, contents.ranges(seeds)) for state in order if (seeds := one.of_state(state))
-                ],
+                "states": [(state, contents.ranges(seeds)) for state in order if (seeds := one.of_state(state))],
             }
             for one in configurations
         ],
