@@ -97,7 +97,8 @@ def _box(element: Any) -> dict[str, float]:
 def test_every_letter_can_be_read(page: Any) -> None:
     """Also those of the charts, which are drawn to the size of the window."""
     sizes = page.evaluate(
-        "[...document.querySelectorAll('p, td, th, li, dd, code, summary, .chart text')].filter(e => e.checkVisibility())"
+        "[...document.querySelectorAll('p, td, th, li, dd, code, summary, .chart text')]"
+        ".filter(e => e.checkVisibility())"
         ".map(e => parseFloat(getComputedStyle(e).fontSize) * (e.closest('svg')?.getScreenCTM().a ?? 1))"
     )
     assert min(sizes) >= 11

@@ -34,8 +34,14 @@ def composed() -> tuple[Listed, ...]:
 
 @pytest.fixture
 def jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Listed, ...]:
-    """APEX: two seeds finished, one failed, one never started; SPACE: one finished on other data, three never started."""
+    """APEX: two seeds finished, one failed, one waiting; SPACE: one finished on other data, the others waiting.
+
+    They are composed once for all tests; a test with other words composes its own.
+    """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(
+        asked, "listed", lambda words, conf: [j.again() for j in composed()] if words == WORDS else listed(words, conf)
+    )
     apex, space = composed()[:4], composed()[4:]
     made(apex[0], versions={"torch": "2.11.0"})
     made(apex[1])

@@ -198,7 +198,7 @@ def reseeded(words: Sequence[str], seeds: Sequence[int]) -> list[str]:
 def _limit(asked: Asked) -> str:
     movies = "" if asked.movies else " No movies were asked for (videos=false)."
     return (
-        f"Film strips and movies are of one seed of each configuration ({STRIP} and {MOVIE} in its folder) and may take "
-        f"{asked.megabytes:g} MB (megabytes={asked.megabytes:g}); film strips come first.{movies} Panels of single "
-        "components, scores of single videos, logs and checkpoints are in the run folders."
+        f"Film strips and movies are of one seed of each configuration ({STRIP} and {MOVIE} in its folder) and may "
+        f"take {asked.megabytes:g} MB (megabytes={asked.megabytes:g}); film strips come first.{movies} Panels of "
+        "single components, scores of single videos, logs and checkpoints are in the run folders."
     )

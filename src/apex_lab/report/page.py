@@ -81,7 +81,7 @@ class Report:
 
 
 def render(report: Report) -> str:
-    """The report as HTML 5. Every text in it is escaped; a browser runs no script but the page's own and loads nothing."""
+    """The report as HTML 5. All text is escaped; a browser runs no script but the page's own and loads nothing."""
     environment = _environment()
     style, script = (_source(environment, name) for name in ("style.css", "script.js"))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
