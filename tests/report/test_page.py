@@ -81,7 +81,7 @@ def report(tmp_path: Path) -> Report:
     strip = Picture("data:image/png;base64,AAAA", 10, 20)
     return Report(
         title=NASTY,
-        made=Made(NASTY, NASTY, NASTY, NASTY, NASTY, NASTY),
+        made=Made(NASTY, NASTY, NASTY, NASTY, NASTY, NASTY, NASTY),
         configurations=rows,
         tables=[table],
         panels=panels,
@@ -151,7 +151,7 @@ def test_numbers_of_the_overview(report: Report) -> None:
 
 
 def test_an_empty_report_says_so() -> None:
-    made = Made("2026-01-01", "a", "b", "c", "0.1", None)
+    made = Made("2026-01-01", "a", "b", "c", "d", "0.1", None)
     page = render(Report("Report", made, [], [], [], [], [], [], "limit"))
     text = Parsed(page).text
     for sentence in ("None: no run failed", "Nothing: every run", "No run has curves", "No finished run has pictures"):

@@ -32,7 +32,6 @@ from apex_lab.config.reader import Reader, ending
 from apex_lab.report.assemble import Asked, assemble
 from apex_lab.report.contents import size_text
 from apex_lab.report.page import render
-from apex_lab.runs import provenance
 from apex_lab.runs.listed import listed
 from apex_lab.tables import definition
 from apex_lab.tables.asked import EVERYTHING, Tables, TablesConfig
@@ -92,7 +91,7 @@ def write(words: Sequence[str], config_dir: str | None = None) -> Path:
         specification=definition.load(),
         config_dir=config_dir,
     )
-    report = assemble(Asked(rest, words, own.videos, own.megabytes), asked_tables, provenance.commit()[0])
+    report = assemble(Asked(rest, words, own.videos, own.megabytes), asked_tables)
     outputs = Path(jobs[0].raw["paths"]["outputs"])
     path = (Path(own.folder) if own.folder else outputs / "reports" / slug(rest)) / FILE
     make_folder(path.parent)

@@ -15,12 +15,13 @@ from apex_lab.report.contents import Configuration, Seed, typed
 from apex_lab.report.page import Made, Missing, Report
 from apex_lab.report.pictures import MEGABYTE, MOVIE, STRIP, Budget
 from apex_lab.report.tables import views
+from apex_lab.runs import provenance
 from apex_lab.runs.listed import Listed
 from apex_lab.tables.asked import Made as MadeTables
 from apex_lab.tables.asked import Tables
 from apex_lab.tables.asked import assemble as make_tables
 from apex_lab.tables.definition import Specification
-from apex_lab.tables.missing_runs import ARRANGE, Command
+from apex_lab.tables.missing_runs import ARRANGE, RETRY, Command
 
 TASK = ("data", "scale")
 """Groups that a label names only where a report has several of them."""
@@ -42,13 +43,12 @@ class Asked(NamedTuple):
     megabytes: float
 
 
-def assemble(asked: Asked, tables: Tables, commit: str | None) -> Report:
+def assemble(asked: Asked, tables: Tables) -> Report:
     """Everything on the page.
 
     Args:
         asked: by the command.
         tables: its jobs, at least one, and how tables are made from them.
-        commit: of the code that makes the report.
     """
     jobs = tables.jobs
     rows = configurations(jobs, tables.specification)
@@ -62,13 +62,15 @@ def assemble(asked: Asked, tables: Tables, commit: str | None) -> Report:
     settings, setting_remarks = contents.settings(rows)
     now = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     outputs = list(dict.fromkeys(str(job.raw["paths"]["outputs"]) for job in jobs))
+    commit, dirty = provenance.commit()
     made = Made(
         date=now,
         command=typed(asked.command, "report"),
         train=typed([*asked.words, *(["-m"] if len(jobs) > 1 else [])]),
         outputs=", ".join(str(Path(folder).absolute()) for folder in outputs),
+        retry=typed([*asked.words, RETRY, "-m"]),
         version=apex_lab.__version__,
-        commit=commit,
+        commit=f"{commit} with changes that are in no commit" if commit and dirty else commit,
     )
     return Report(
         title=title(asked.words),
@@ -171,8 +173,8 @@ def missing(rows: Sequence[Configuration], jobs: Sequence[Listed]) -> list[Missi
     words: Mapping[str, tuple[str, ...]] = {job.name: job.words for job in reversed(jobs)}
     found = []
     for row in rows:
-        for states, what in ((("waiting",), "never started"), (("paused",), "paused"), (("running",), "running now")):
-            seeds = row.of_state(*states)
+        for state, what in (("waiting", "never started"), ("paused", "paused")):
+            seeds = row.of_state(state)
             if seeds:
                 text = f"seed{'s' if len(seeds) > 1 else ''} {contents.ranges(seeds)} {what}"
                 found.append(Missing(row.label, text, typed(reseeded(words[row.name], seeds))))

@@ -39,6 +39,7 @@ class Made:
         date: ISO 8601, UTC.
         command: that makes it again.
         train: that makes or resumes its runs.
+        retry: the same, failed ones too.
         outputs: where the runs lie.
         version, commit: of the code that made the report; the commit is None outside a repository.
     """
@@ -46,6 +47,7 @@ class Made:
     date: str
     command: str
     train: str
+    retry: str
     outputs: str
     version: str
     commit: str | None

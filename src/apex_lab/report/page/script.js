@@ -11,7 +11,7 @@ for (const figure of document.querySelectorAll(".chart")) {
   figure.append(tip);
   const hide = () => { tip.hidden = true; pointer.style.visibility = "hidden"; };
   drawing.addEventListener("pointerleave", hide);
-  drawing.addEventListener("pointermove", event => {
+  const read = event => {
     const box = drawing.getBoundingClientRect(), frame = figure.getBoundingClientRect();
     const x = (event.clientX - box.left) / box.width * drawing.viewBox.baseVal.width;
     const near = series.filter(one => one.readings.length && !one.group.classList.contains("off")).map(one => ({
@@ -32,7 +32,9 @@ for (const figure of document.querySelectorAll(".chart")) {
     const left = event.clientX - frame.left;
     tip.style.left = `${Math.max(0, Math.min(left + 14, frame.width - tip.offsetWidth))}px`;
     tip.style.top = `${event.clientY - frame.top + 18}px`;
-  });
+  };
+  drawing.addEventListener("pointermove", read);
+  drawing.addEventListener("pointerdown", read);
 }
 
 // A click on a legend's entry takes its configuration out of the charts, and back in.
