@@ -70,7 +70,9 @@ def test_a_report_tells_what_is_there_what_failed_and_what_is_missing(jobs: tupl
     assert "APEX : seed 3 never started python -m apex_lab.train model=apex scale=smoke seed=3" in text
     assert "SPACE : seeds 1–3 never started python -m apex_lab.train model=space scale=smoke seed=1,2,3 -m" in text
     assert "python -m apex_lab.report model=apex,space scale=smoke seed=0,1,2,3" in text
-    assert "python -m apex_lab.train model=apex,space scale=smoke seed=0,1,2,3 hydra.sweeper.retry_failed=true -m" in text
+    assert (
+        "python -m apex_lab.train model=apex,space scale=smoke seed=0,1,2,3 hydra.sweeper.retry_failed=true -m" in text
+    )
     assert "torch 2.13.0 (3); 2.11.0 (1)" in text
     assert "c0ffee (3 runs); c0ffee with changes that are in no commit (1 run)" in text
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from apex_lab.tables.build import Built
+from apex_lab.tables.found import and_list
 from apex_lab.tables.markdown import NO, YES, heading, label, number, ours
 from apex_lab.tables.rows import TRACKING, Line
 
@@ -51,10 +52,7 @@ class TableView:
 def views(tables: Sequence[Built], scales: Sequence[str]) -> list[TableView]:
     """All tables that have a value; `scales` are those of the runs."""
     other = [scale for scale in dict.fromkeys(scales) if scale != "paper"]
-    warning = (
-        f"Not paper scale: these runs are of scale {' and '.join(other)}, so their values cannot be compared with the "
-        "paper's, which stand beside them for orientation."
-    )
+    warning = f"Not paper scale but {and_list(other)}: the paper's values stand beside these for orientation alone."
     return [_view(table, warning if other else None) for table in tables]
 
 
