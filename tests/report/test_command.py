@@ -178,8 +178,7 @@ def test_labels_tell_configurations_apart() -> None:
     first = composed()[0]
 
     def job(change: str, **choices: str) -> Listed:
-        raw = {**first.raw, "optimizer": {**first.raw["optimizer"], "lr": change}}
-        return Listed((f"optimizer.lr={change}",), raw, {**first.choices, **choices}, first.state)
+        return Listed((f"optimizer.lr={change}",), first.raw, {**first.choices, **choices}, change * 64, first.state)
 
     def labels(*jobs: Listed) -> list[str]:
         return [row.label for row in configurations(jobs, definition.load())]
