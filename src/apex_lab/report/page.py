@@ -14,6 +14,7 @@ from markupsafe import Markup
 
 from apex_lab.report import charts, contents
 from apex_lab.report.contents import Configuration, Panel, Pictures, Settings
+from apex_lab.report.facts import facts
 from apex_lab.report.tables import TableView
 
 CONTENTS = (
@@ -102,7 +103,7 @@ def render(report: Report) -> str:
             **{"left": charts.LEFT, "right": charts.RIGHT, "top": charts.TOP, "bottom": charts.BOTTOM},
         },
         overview=_overview(report.configurations),
-        facts=contents.facts(report.configurations),
+        facts=facts(report.configurations),
         failures=_failures(report.configurations),
     )
 
