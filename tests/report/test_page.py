@@ -150,6 +150,30 @@ def test_numbers_of_the_overview(report: Report) -> None:
     assert "failed at step 12" in text
 
 
+def test_what_is_too_much_is_left_out_and_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = []
+    for name in "ABC":
+        seeds = tuple(
+            seed(number, state, tmp_path / name) for number, state in enumerate(("waiting", "failed", "lost"))
+        )
+        for one in seeds[1:]:
+            one.state.folder.mkdir(parents=True)
+            (one.state.folder / "curves.csv").write_text("step,train/loss\n1,2\n2,1\n")
+        rows.append(Configuration(name, name, name, {}, {"a": 1}, seeds))
+    monkeypatch.setattr(contents, "CURVES", 2)
+    monkeypatch.setattr(contents, "CURVE_SEEDS", 1)
+    monkeypatch.setattr(contents, "SETTINGS", 1)
+    monkeypatch.setattr(contents, "COLORS", 1)
+    panels, remarks = contents.panels(rows)
+    assert [panel.legend for panel in panels] == [[("A", 0)], [("B", 0)]]
+    assert [list(panel.charts[0].lines[0].thin) for panel in panels] == [[1], [1]]
+    assert remarks == [
+        "Curves of the first 2 of 3 configurations; not of C.",
+        "Curves, their means and bands are of the first 1 seeds of each configuration.",
+    ]
+    assert contents.settings(rows)[1] == ["Not printed, for there are more than 1: B, C."]
+
+
 def test_an_empty_report_says_so() -> None:
     made = Made("2026-01-01", "a", "b", "c", "d", "0.1", None)
     page = render(Report("Report", made, [], [], [], [], [], [], "limit"))

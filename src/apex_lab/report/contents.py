@@ -75,6 +75,11 @@ class Configuration:
         return [seed for seed in self.seeds if seed.state.state == DONE]
 
     @property
+    def started(self) -> list[Seed]:
+        """Seeds that have left something behind."""
+        return [seed for seed in self.seeds if seed.state.state != "waiting"]
+
+    @property
     def hours(self) -> float:
         """Of training, of all seeds."""
         return sum(seed.hours for seed in self.seeds)
@@ -129,8 +134,8 @@ def panels(configurations: Sequence[Configuration]) -> tuple[list[Panel], list[s
     remarks = []
     if rest:
         remarks.append(f"Curves of the first {CURVES} of {len(trained)} configurations; not of {_several(rest)}.")
-    if any(len(one.seeds) > CURVE_SEEDS for one in shown):
-        remarks.append(f"Curves, means and deviations are of the first {CURVE_SEEDS} seeds of each configuration.")
+    if any(len(one.started) > CURVE_SEEDS for one in shown):
+        remarks.append(f"Curves, their means and bands are of the first {CURVE_SEEDS} seeds of each configuration.")
     found: list[Panel] = []
     by_task: dict[tuple[str, str], list[Configuration]] = {}
     for one in shown:
@@ -148,7 +153,7 @@ def panels(configurations: Sequence[Configuration]) -> tuple[list[Panel], list[s
 def _panel(title: str, configurations: Sequence[Configuration]) -> Panel:
     columns = [quantity.key for quantity in (*SCORES, LOSS)]
     read: list[dict[int, dict[str, Points]]] = [
-        {seed.number: read_curves(seed.state.folder / "curves.csv", columns) for seed in one.seeds[:CURVE_SEEDS]}
+        {seed.number: read_curves(seed.state.folder / "curves.csv", columns) for seed in one.started[:CURVE_SEEDS]}
         for one in configurations
     ]
 
