@@ -100,6 +100,7 @@ def test_every_job_of_a_sweep_is_checked_before_the_first_starts(train: Callable
             "hydra.sweeper.slots=0: give the number of jobs that a machine does at once, or null.",
         ),
         ("hydra/launcher=jobli", "hydra/launcher=jobli: there is no such choice in basic"),
+        ("hydra.sweeper.slot=2", "Unknown key hydra.sweeper.slot=2; did you mean 'slots'?"),
         ("+hydra.launcher.tasks_per_node=2", "Unknown key hydra.launcher.tasks_per_node=2."),
     ],
 )
