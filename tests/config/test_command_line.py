@@ -92,6 +92,22 @@ def test_every_job_of_a_sweep_is_checked_before_the_first_starts(train: Callable
     refused(train("model.components=2,3,1", "seed=range(2)", "-m"), "components = 1 leaves no room", tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (
+            "hydra.sweeper.slots=0",
+            "hydra.sweeper.slots=0: give the number of jobs that a machine does at once, or null.",
+        ),
+        ("hydra/launcher=jobli", "hydra/launcher=jobli: there is no such choice in basic"),
+        ("hydra.sweeper.slot=2", "Unknown key hydra.sweeper.slot=2; did you mean 'slots'?"),
+        ("+hydra.launcher.tasks_per_node=2", "Unknown key hydra.launcher.tasks_per_node=2."),
+    ],
+)
+def test_launchers_that_cannot_be(words: str, told: str, train: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(train("seed=0,1", words, "-m"), told, tmp_path)
+
+
 def test_two_ablations_of_one_run(train: Callable[..., Ended], tmp_path: Path) -> None:
     told = "ablation is given twice: choose one, or write +ablation=no_entropy,image_stn -m to run each."
     refused(train("+ablation=no_entropy", "+ablation=image_stn"), told, tmp_path)

@@ -10,7 +10,7 @@ from hydra.core.utils import JobReturn, JobStatus
 
 from apex_lab.base import console
 from apex_lab.config import sweeps
-from apex_lab.config.sweeps import Item, JobBusy, JobFailed, Sweep
+from apex_lab.config.sweeps import Item, JobBusy, JobFailed, JobStopped, Sweep
 
 
 @dataclass
@@ -121,6 +121,58 @@ def test_a_launcher_that_breaks_fails_what_had_not_ended() -> None:
     run.run(broken)
     assert run.outcomes[0] == ("finished", None)
     assert run.failures == [("job b", "the launcher ended with MemoryError: a worker was killed")]
+
+
+def test_jobs_of_a_broken_launcher_are_launched_once_more(capsys: pytest.CaptureFixture[str]) -> None:
+    states = {
+        "a": [Known("waiting"), Known("lost")],  # its worker died
+        "b": [Known("waiting")],  # had not begun
+        "c": [Known("waiting"), Known("interrupted")],  # was stopped
+        "d": [Known("waiting"), Known("running"), Known("running"), Known("finished")],  # another sweep's
+    }
+    launcher = Launcher({"a": ["finished"], "b": ["finished"], "d": [JobBusy("locked")]})
+    launched: list[list[str]] = []
+
+    def breaks_once(jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]:
+        launched.append([job[0] for job in jobs])
+        if len(launched) == 1:
+            raise RuntimeError("a worker is gone")
+        return launcher(jobs, first)
+
+    run = sweep(states)
+    run.run(breaks_once)
+    assert launched[0] == ["a", "b", "c", "d"]
+    assert sorted(name for names in launched[1:] for name in names) == ["a", "b"]
+    assert {index: state for index, (state, _) in run.outcomes.items()} == {
+        0: "finished",
+        1: "finished",
+        2: "interrupted",
+        3: "finished",
+    }
+    assert (
+        "the launcher ended with RuntimeError: a worker is gone; 3 jobs that have not ended" in capsys.readouterr().err
+    )
+
+
+def test_a_launcher_that_cannot_start_is_not_asked_again() -> None:
+    launched = 0
+
+    def broken(jobs: Sequence[Sequence[str]], first: int) -> Sequence[JobReturn]:
+        nonlocal launched
+        launched += 1
+        raise RuntimeError("no sbatch here")
+
+    run = sweep({"a": [Known("waiting")], "b": [Known("waiting")]})
+    run.run(broken)
+    assert launched == 1
+    assert [reason for _, reason in run.failures] == ["the launcher ended with RuntimeError: no sbatch here"] * 2
+
+
+def test_a_job_that_was_stopped_is_no_failure() -> None:
+    run = sweep({"a": [Known("waiting")], "b": [Known("waiting")]})
+    run.run(Launcher({"a": [JobStopped(15)], "b": ["finished"]}))
+    assert run.outcomes == {0: ("interrupted", "stopped by SIGTERM"), 1: ("finished", None)}
+    assert (run.failures, run.stopped) == ([], 15)
 
 
 def test_jobs_that_leave_nothing_behind() -> None:

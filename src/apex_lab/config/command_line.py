@@ -360,8 +360,8 @@ _FREE = (
 
 
 def _check_hydra_keys(name: str, extra: Sequence[str], overrides: Sequence[str]) -> None:
-    """Refuses keys that Hydra's own configuration does not have, which `+` and `++` would add without a word."""
-    added = [word for word in overrides if re.match(r"\+\+?hydra\.", word) and not word.lstrip("+").startswith(_FREE)]
+    """Refuses keys that Hydra's own configuration does not have; `+` and `++` would add them without a word."""
+    added = [word for word in overrides if re.match(r"\+{0,2}hydra\.", word) and not word.lstrip("+").startswith(_FREE)]
     if not added:
         return
     groups = [word for word in overrides if word.startswith("hydra/")]
@@ -378,6 +378,8 @@ def _check_launcher(name: str, extra: Sequence[str], overrides: Sequence[str]) -
     """Refuses a launcher that is not there, keys that it does not have, and what jobs cannot be launched with."""
     ours = ("hydra/launcher", "hydra.launcher", "hydra/sweeper", "hydra.sweeper")
     words = [word for word in overrides if word.lstrip("+~").startswith(ours)]
+    if not words:
+        return
     hydra_part = compose(name, overrides=[*extra, *words], return_hydra_config=True).hydra
     for key in ("tasks_per_node", "nodes"):
         if hydra_part.launcher.get(key, 1) != 1:

@@ -291,7 +291,9 @@ def start_ray(settings: Any) -> None:
     if not ray.is_initialized():
         if settings.get("address") is None:
             settings.setdefault("object_store_memory", 78643200)  # as the launcher does: jobs keep nothing in there
-        ray.init(**dict(OmegaConf.to_container(settings, resolve=True)))
+        plain = OmegaConf.to_container(settings, resolve=True)
+        assert isinstance(plain, dict)
+        ray.init(**{str(key): value for key, value in plain.items()})
 
 
 @contextlib.contextmanager
