@@ -36,7 +36,7 @@ def as_in_tables(run: Path) -> dict[str, Any]:
     assert isinstance(found, SeedRun)
     about = record(run)
     return {
-        **{name: getattr(found, name) for name in ("state", "why", "scores", "protocol", "share", "failure", "words")},
+        **{name: getattr(found, name) for name in ("state", "why", "scores", "protocol", "share", "failure")},
         "record": found.record,
         **{name: about[name] for name in ("steps", "seconds", "started", "data_fingerprint")},
         "starts": about["history"],
