@@ -317,6 +317,7 @@ def test_tables_see_a_paused_run_as_unfinished(train: Callable[..., Ended], the_
 
     train("trainer.max_minutes=1e-6")
     found = read_run(the_run(), 0)
+    assert found is not None
     assert found.state == "unfinished"
     assert found.why == "its last word is: stopped after 1e-06 minutes (trainer.max_minutes)."
 

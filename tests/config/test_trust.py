@@ -15,7 +15,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import write_json
 from apex_lab.config import trust
 from apex_lab.runs.folder import group_name, run_folder
-from apex_lab.tables.found import collect
+from apex_lab.runs.progress import found
 from apex_lab.training.ranks import Ranks
 from apex_lab.training.worker import train_along
 from tests.conftest import REPOSITORY, Ended, compose_job
@@ -230,7 +230,7 @@ def test_the_config_yaml_of_a_run_folder_is_compared_and_never_built(
     for text in (yaml.safe_dump(hostile), f"model: !!python/object/apply:os.system ['touch {proof}']", "seed: 0"):
         (planted / "config.yaml").write_text(text)
         assert run_folder(job).parent.name == group_name(job)
-        assert [run.folder for run in collect(Path("outputs"))] == [planted]
+        assert [run.state.folder for run in found(Path("outputs")).jobs] == [planted]
         assert not proof.exists()
 
 

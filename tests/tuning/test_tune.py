@@ -12,7 +12,7 @@ import yaml
 from optuna.trial import TrialState
 
 from apex_lab.base.files import read_json
-from apex_lab.tables.found import collect
+from apex_lab.runs.identity import seed_folders
 from apex_lab.tuning.storage import Journal
 from tests.conftest import TINY, Ended
 
@@ -64,8 +64,8 @@ def test_a_study_from_command_to_tuned_run(
         assert stored["optimizer"]["lr"] == trial.params["optimizer.lr"]
         assert stored["model"]["width"] == trial.params["model.width"]
     studies = tmp_path / "outputs" / "studies" / "small"
-    assert len(collect(studies)) == 2
-    assert not collect(tmp_path / "outputs")  # tables of ordinary runs do not meet them
+    assert len(seed_folders(studies)) == 2
+    assert not seed_folders(tmp_path / "outputs")  # they are not among ordinary runs
     for kind in ("history", "importance", "contour"):
         assert (studies / "plots" / f"{kind}.png").read_bytes().startswith(b"\x89PNG")
         page = (studies / "plots" / f"{kind}.html").read_text()
@@ -85,11 +85,10 @@ def test_a_study_from_command_to_tuned_run(
     words = ["--config-dir", str(tmp_path / "both"), *TINY[2:], "trainer.max_steps=1", "+tuned=small"]
     ended = command("train", *words)
     assert ended.code == 0, ended.err
-    (run,) = collect(tmp_path / "outputs")
-    assert run.group.startswith("tiny_tuned_small_squares_smoke_")
-    assert run.record is not None
-    assert run.record.tuned == "small"
-    stored = yaml.safe_load((run.folder / "config.yaml").read_text())
+    (run,) = seed_folders(tmp_path / "outputs")
+    assert run.parent.name.startswith("tiny_tuned_small_squares_smoke_")
+    assert read_json(run / "run.json")["tuned"] == "small"
+    stored = yaml.safe_load((run / "config.yaml").read_text())
     assert stored["optimizer"]["lr"] == best.params["optimizer.lr"]
 
 
