@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import multiprocessing
 import os
 import signal
 import socket
@@ -33,6 +34,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from apex_lab.base import attached, console, interrupts, slots
 from apex_lab.base.interrupts import Interrupted
+from apex_lab.base.processes import alive
 from apex_lab.config.sweeps import JobBusy, JobFailed, JobStopped
 
 POLL = 0.2
@@ -83,14 +85,9 @@ class Origin:
         """The signal that the sweep got; SIGTERM where its process died, and its jobs with it."""
         with contextlib.suppress(OSError, ValueError):
             return int(self.stop_file(sweep_folder).read_text())
-        if self.host == socket.gethostname() and os.environ.get("SUBMITIT_EXECUTOR") != "slurm":
-            try:
-                os.kill(self.pid, 0)
-            except ProcessLookupError:
-                return signal.SIGTERM
-            except OSError:
-                pass
-        return None  # jobs in a queue of Slurm's outlive the process that has put them there
+        here = self.host == socket.gethostname() and os.environ.get("SUBMITIT_EXECUTOR") != "slurm"
+        # jobs in a queue of Slurm's outlive the process that has put them there
+        return signal.SIGTERM if here and not alive(self.pid) else None
 
     def relaying(self, launcher: Any, sweep_folder: str) -> contextlib.AbstractContextManager[None]:
         """`relaying` for the jobs of a launcher of Hydra's."""
@@ -134,7 +131,14 @@ def run(origin: Origin) -> str:
                 return _supervise(origin, own, title, slot, asked)
         except JobStopped:
             noted.pass_on()
+            _end_orphan(origin)
             raise
+
+
+def _end_orphan(origin: Origin) -> None:
+    """Ends a worker of joblib whose sweep was killed: it would wait for further jobs, and hold the sweep's output open."""
+    if multiprocessing.current_process().name.startswith("Loky") and not alive(origin.pid):
+        os._exit(128 + signal.SIGTERM)
 
 
 def _stop_if(signum: int | None) -> None:

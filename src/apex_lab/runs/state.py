@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
+from apex_lab.base.processes import alive
 
 RECORD = "run.json"
 LOCK = ".lock"
@@ -100,13 +101,8 @@ def _state(folder: Path, record: dict[str, Any]) -> tuple[State, str | None]:
 def _alive(folder: Path, record: dict[str, Any]) -> bool:
     """Whether the process that works in a folder is there."""
     pid = record.get("pid")
-    if record.get("host") == socket.gethostname() and isinstance(pid, int):
-        try:
-            os.kill(pid, 0)
-        except ProcessLookupError:
-            return False
-        except OSError:
-            pass  # there, and another user's
+    if record.get("host") == socket.gethostname() and isinstance(pid, int) and not alive(pid):
+        return False
     try:
         return time.time() - (folder / LOCK).stat().st_mtime < LOST
     except OSError:
