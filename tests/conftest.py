@@ -29,6 +29,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 REPOSITORY = Path(__file__).parent.parent
+# The processes that tests start run this working tree too, wherever the installed package may lie.
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(REPOSITORY / "src"), str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]
+)
 TINY = (
     "--config-dir",
     str(REPOSITORY / "tests" / "conf"),

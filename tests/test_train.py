@@ -20,7 +20,7 @@ from filelock import FileLock
 
 from apex_lab.runs import checkpoints
 from apex_lab.train import main
-from tests.conftest import REPOSITORY, TINY, Ended
+from tests.conftest import TINY, Ended
 
 LONG = ("trainer.max_steps=60", "trainer.checkpoint_interval=7", "trainer.validation_interval=20")
 """Enough steps to be killed among."""
@@ -47,7 +47,6 @@ def start(folder: Path, *words: str, code: str = "from apex_lab.train import mai
     """Trains the tiny model in a process of its own, which can be killed."""
     environment = {
         **os.environ,
-        "PYTHONPATH": f"{REPOSITORY / 'src'}{os.pathsep}{REPOSITORY}",
         "OMP_NUM_THREADS": "1",
         "TINY_PAUSE": "0.2",
     }

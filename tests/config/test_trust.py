@@ -14,8 +14,9 @@ import yaml
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import write_json
 from apex_lab.config import trust
+from apex_lab.runs import progress
 from apex_lab.runs.folder import group_name, run_folder
-from apex_lab.runs.progress import found
+from apex_lab.tables.found import read_run
 from apex_lab.training.ranks import Ranks
 from apex_lab.training.worker import train_along
 from tests.conftest import REPOSITORY, Ended, compose_job
@@ -230,7 +231,8 @@ def test_the_config_yaml_of_a_run_folder_is_compared_and_never_built(
     for text in (yaml.safe_dump(hostile), f"model: !!python/object/apply:os.system ['touch {proof}']", "seed: 0"):
         (planted / "config.yaml").write_text(text)
         assert run_folder(job).parent.name == group_name(job)
-        assert [run.state.folder for run in found(Path("outputs")).jobs] == [planted]
+        assert [seen.state.folder for seen in progress.found(Path("outputs")).jobs] == [planted]
+        assert read_run(planted, 0) is not None
         assert not proof.exists()
 
 

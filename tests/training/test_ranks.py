@@ -17,7 +17,7 @@ import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.training.ranks import Ranks, given, started
-from tests.conftest import REPOSITORY, TINY, Ended
+from tests.conftest import TINY, Ended
 
 WORDS = (
     *TINY,
@@ -31,7 +31,6 @@ WORDS = (
 def start(folder: Path, *words: str, pause: float = 0.0) -> subprocess.Popen[str]:
     environment = {
         **os.environ,
-        "PYTHONPATH": f"{REPOSITORY / 'src'}{os.pathsep}{REPOSITORY}",
         "OMP_NUM_THREADS": "1",
         "TINY_PAUSE": str(pause),
     }
