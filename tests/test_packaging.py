@@ -48,8 +48,8 @@ def test_the_wheel_s_own_configuration_is_used_from_any_folder(wheel: Path, tmp_
         result = subprocess.run(words, cwd=elsewhere, env=environment, capture_output=True, text=True, check=True)
         return result.stdout
 
-    assert ask("-c", "from apex_lab.config.schema import conf_dir; print(conf_dir())").strip() == str(
-        site / "apex_lab/conf"
-    )
-    assert "max_steps: 6\n" in ask("-m", "apex_lab.train", "scale=smoke", "--cfg", "job")
+    where = "from apex_lab.config.composition import conf_dir; print(conf_dir())"
+    told = ask("-c", f"{where}; from apex_lab.train import main; main()", "scale=smoke", "--cfg", "job")
+    assert told.splitlines()[0] == str(site / "apex_lab/conf")
+    assert "max_steps: 6\n" in told
     assert list(elsewhere.iterdir()) == []
