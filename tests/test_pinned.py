@@ -49,10 +49,10 @@ class Stop(L.Callback):
     ],
 )
 def test_losses_of_fifty_steps(
-    scale: str, steps: int, command: Callable[..., Ended], the_run: Callable[..., Path]
+    scale: str, steps: int, command: Callable[..., Ended], the_run: Callable[..., Path], p2d_smoke: str
 ) -> None:
     stop = ("+callbacks.stop._target_=tests.test_pinned.Stop", f"+callbacks.stop.after={steps}")
-    ended = command("train", *WORDS[scale], *(stop if steps < 50 else ()), "evaluation.videos=1")
+    ended = command("train", *WORDS[scale], *(stop if steps < 50 else ()), "evaluation.videos=1", p2d_smoke)
     assert ended.code == 0, ended.err
     with open(the_run() / "curves.csv", newline="") as file:
         rows = list(csv.DictReader(file))

@@ -103,14 +103,11 @@ def test_a_hostile_checkpoint_runs_nothing(
     assert not proof.exists()
 
 
-def test_a_class_of_the_users_own_needs_trust(
-    train: Callable[..., Ended], command: Callable[..., Ended], the_run: Callable[..., Path]
-) -> None:
-    assert train().code == 0
-    ended = command("evaluate", f"checkpoint={the_run()}", "trust=false")
+def test_a_class_of_the_users_own_needs_trust(trained: Path, command: Callable[..., Ended]) -> None:
+    ended = command("evaluate", f"checkpoint={trained}", "trust=false")
     assert ended.code == 2
     assert "wants to build 'tests.tiny." in ended.err
-    assert command("evaluate", f"checkpoint={the_run()}", "trust=true", "pictures=0").code == 0
+    assert command("evaluate", f"checkpoint={trained}", "trust=true", "pictures=0").code == 0
 
 
 ENV = "${oc.env:HOME}"
