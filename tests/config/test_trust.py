@@ -72,7 +72,11 @@ def test_the_projects_own_components_are_allowed(name: str) -> None:
 
 def test_every_shipped_component_is_allowed() -> None:
     for path in (REPOSITORY / "conf").rglob("*.yaml"):
-        trust.check(yaml.safe_load(path.read_text()), str(path))
+        content = yaml.safe_load(path.read_text())
+        if path.parent.parent.name == "study":  # samplers and pruners are a study's; no checkpoint holds them
+            assert content["_target_"].startswith(f"optuna.{path.parent.name}s.")
+        else:
+            trust.check(content, str(path))
 
 
 @pytest.mark.parametrize(
