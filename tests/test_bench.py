@@ -160,15 +160,8 @@ assert loss.isfinite()
 """
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        (),
-        pytest.param(("+ablation=image_stn",), marks=pytest.mark.slow),
-        pytest.param(("+ablation=gaussian_scalor_norm",), marks=pytest.mark.slow),
-    ],
-    ids=" ".join,
-)
+@pytest.mark.slow  # nearly all that breaks a graph also waits for the device, which is tested above
+@pytest.mark.parametrize("words", [(), ("+ablation=image_stn",), ("+ablation=gaussian_scalor_norm",)], ids=" ".join)
 def test_the_training_step_is_one_graph(words: tuple[str, ...], tmp_path: Path) -> None:
     # In a process of its own, because the type checks of the tests cannot be compiled (pytorch #122093).
     raw = json.dumps(compose_job(*APEX[:3], *words).raw)

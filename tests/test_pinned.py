@@ -66,7 +66,7 @@ def test_losses_of_fifty_steps(
 
 def test_scores_of_the_shipped_weights(command: Callable[..., Ended], tmp_path: Path) -> None:
     content = torch.load(REPOSITORY / "sweeps" / "results" / "apex_p2d_cpu.ckpt", weights_only=True)
-    content["config"]["data"].update(train=2, val=2, test=4)
+    content["config"]["data"].update(train=1, val=1, test=4)
     torch.save(content, tmp_path / "few.ckpt")
     ended = command("evaluate", "checkpoint=few.ckpt", "folder=scores", "pictures=0")
     assert ended.code == 0, ended.err
