@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import hypothesis
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
@@ -28,7 +31,15 @@ from apex_lab.config.schema import Job, check_job  # noqa: E402
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# A slow or busy machine is no flaw of what is tested.
+hypothesis.settings.register_profile("no deadline", deadline=None)
+hypothesis.settings.load_profile("no deadline")
+
 REPOSITORY = Path(__file__).parent.parent
+# The processes that tests start run this working tree too, wherever the installed package may lie.
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(REPOSITORY / "src"), str(REPOSITORY), *filter(None, [os.environ.get("PYTHONPATH")])]
+)
 TINY = (
     "--config-dir",
     str(REPOSITORY / "tests" / "conf"),
@@ -59,8 +70,6 @@ def command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Callable[..., Ended]:
     """Runs an entry point in this process, in the test's folder: command("train", "seed=1") -> `Ended`."""
-    import importlib
-
     monkeypatch.chdir(tmp_path)
     for name in [name for name in os.environ if name.startswith(("WANDB_", "APEX_LAB_", "TINY_"))]:
         monkeypatch.delenv(name)
@@ -114,3 +123,27 @@ def the_run(tmp_path: Path) -> Callable[..., Path]:
         return found[0]
 
     return find
+
+
+@pytest.fixture(scope="session")
+def _outputs_of_one_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("one_run")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.chdir(folder)
+        patched.setattr(sys, "argv", ["train", *TINY])
+        importlib.import_module("apex_lab.train").main()
+    return folder / "outputs"
+
+
+@pytest.fixture
+def trained(_outputs_of_one_run: Path, tmp_path: Path) -> Path:
+    """Folder of a finished run of the tiny model, as `train()` leaves it; the test's own copy."""
+    shutil.copytree(_outputs_of_one_run, tmp_path / "outputs")
+    [run] = (tmp_path / "outputs").glob("*/seed_0")
+    return run
+
+
+@pytest.fixture(scope="session")
+def p2d_smoke(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A word that lets tests of P2D at scale=smoke share its data, which the first of them makes."""
+    return f"paths.data={tmp_path_factory.mktemp('data')}"

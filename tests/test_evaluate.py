@@ -12,12 +12,6 @@ import torch
 from tests.conftest import REPOSITORY, Ended
 
 
-@pytest.fixture
-def trained(train: Callable[..., Ended], the_run: Callable[..., Path]) -> Path:
-    assert train().code == 0
-    return the_run()
-
-
 def test_a_run_scores_again_as_at_its_end(trained: Path, command: Callable[..., Ended]) -> None:
     before = json.loads((trained / "metrics.json").read_text())
     ended = command("evaluate", f"checkpoint={trained}")

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import torch
 
-from tests.conftest import REPOSITORY, TINY
+from tests.conftest import TINY
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
@@ -52,7 +52,6 @@ class Swept:
     def __init__(self, folder: Path, *words: str, pause: float = 0.2) -> None:
         environment = {
             **{name: value for name, value in os.environ.items() if not name.startswith(("APEX_LAB_", "SLURM_"))},
-            "PYTHONPATH": os.pathsep.join([str(REPOSITORY / "src"), str(REPOSITORY)]),
             "TINY_PAUSE": str(pause),
             "RAY_USAGE_STATS_ENABLED": "0",
         }

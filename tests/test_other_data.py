@@ -18,29 +18,23 @@ def scored(folder: Path) -> dict[str, Any]:
     return json.loads((folder / "metrics.json").read_text())["splits"]["test"]
 
 
-@pytest.fixture
-def run(train: Callable[..., Ended], the_run: Callable[..., Path]) -> Path:
-    assert train().code == 0
-    return the_run()
-
-
-def test_settings_replace_those_of_the_checkpoint(command: Callable[..., Ended], run: Path) -> None:
-    ended = command("evaluate", f"checkpoint={run}", "data.data_seed=5", "data.test=4", "pictures=0")
+def test_settings_replace_those_of_the_checkpoint(command: Callable[..., Ended], trained: Path) -> None:
+    ended = command("evaluate", f"checkpoint={trained}", "data.data_seed=5", "data.test=4", "pictures=0")
     assert ended.code == 0, ended.err
-    [folder] = (run / "evaluate").iterdir()
-    other, own = scored(folder), scored(run)
+    [folder] = (trained / "evaluate").iterdir()
+    other, own = scored(folder), scored(trained)
     assert other["data"]["settings"] == {**own["data"]["settings"], "seed": 5, "test": 4}
     assert other["data"]["fingerprint"] != own["data"]["fingerprint"]
     assert other["videos"] == 4
-    assert scored(run) == own  # the run's own scores stay
-    again = command("evaluate", f"checkpoint={run}", "data.data_seed=5", "data.test=4", "pictures=0")
+    assert scored(trained) == own  # the run's own scores stay
+    again = command("evaluate", f"checkpoint={trained}", "data.data_seed=5", "data.test=4", "pictures=0")
     assert "evaluated already" in again.out
 
 
-def test_another_data_set_in_the_same_sizes(command: Callable[..., Ended], run: Path) -> None:
-    ended = command("evaluate", f"checkpoint={run}", "data=sprites", "data.max_objects=2", "pictures=0")
+def test_another_data_set_in_the_same_sizes(command: Callable[..., Ended], trained: Path) -> None:
+    ended = command("evaluate", f"checkpoint={trained}", "data=sprites", "data.max_objects=2", "pictures=0")
     assert ended.code == 0, ended.err
-    [folder] = (run / "evaluate").iterdir()
+    [folder] = (trained / "evaluate").iterdir()
     about = scored(folder)["data"]
     assert about["name"] == "sprites"
     sizes = {key: about["settings"][key] for key in ("frames", "image_size", "test", "max_objects")}
@@ -57,10 +51,10 @@ def test_another_data_set_in_the_same_sizes(command: Callable[..., Ended], run: 
     ],
 )
 def test_what_cannot_be_is_refused_in_one_sentence(
-    command: Callable[..., Ended], run: Path, words: tuple[str, ...], sentence: str
+    command: Callable[..., Ended], trained: Path, words: tuple[str, ...], sentence: str
 ) -> None:
     Path("x.npz").write_bytes(b"")
-    first = () if words[0].startswith("predictions") else (f"checkpoint={run}",)
+    first = () if words[0].startswith("predictions") else (f"checkpoint={trained}",)
     ended = command("evaluate", *first, *words)
     assert ended.code == 2
     assert sentence in ended.err

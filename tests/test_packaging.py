@@ -25,11 +25,11 @@ def test_the_wheel_holds_code_and_configuration_and_no_tests(wheel: Path) -> Non
     for path in (REPOSITORY / "conf").rglob("*.yaml"):
         assert f"apex_lab/{path.relative_to(REPOSITORY)}" in names
     assert "apex_lab/conf/recipe/apex/paper.yaml" in names
-    for folder in ("src/apex_lab", "sims"):
+    for folder in ("src/apex_lab", "src/hydra_plugins", "sims"):
         for path in (REPOSITORY / folder).rglob("*.py"):
             assert str(path.relative_to(REPOSITORY)).removeprefix("src/") in names
     tops = {name.split("/")[0] for name in names}
-    assert {top for top in tops if not top.endswith(".dist-info")} == {"apex_lab", "sims"}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"apex_lab", "hydra_plugins", "sims"}
     # naive twins are an oracle of the tests and a baseline of the benchmark, both in the repository alone
     twins = {path.name for path in (REPOSITORY / "tests" / "reference").glob("*.py")}
     assert "apex.py" in twins
@@ -48,8 +48,8 @@ def test_the_wheel_s_own_configuration_is_used_from_any_folder(wheel: Path, tmp_
         result = subprocess.run(words, cwd=elsewhere, env=environment, capture_output=True, text=True, check=True)
         return result.stdout
 
-    assert ask("-c", "from apex_lab.config.schema import conf_dir; print(conf_dir())").strip() == str(
-        site / "apex_lab/conf"
-    )
-    assert "max_steps: 6\n" in ask("-m", "apex_lab.train", "scale=smoke", "--cfg", "job")
+    where = "from apex_lab.config.composition import conf_dir; print(conf_dir())"
+    told = ask("-c", f"{where}; from apex_lab.train import main; main()", "scale=smoke", "--cfg", "job")
+    assert told.splitlines()[0] == str(site / "apex_lab/conf")
+    assert "max_steps: 6\n" in told
     assert list(elsewhere.iterdir()) == []

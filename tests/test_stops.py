@@ -19,7 +19,7 @@ import torch
 from apex_lab.runs import checkpoints
 from apex_lab.train import main
 from tests import tiny
-from tests.conftest import REPOSITORY, TINY, Ended, compose_job
+from tests.conftest import TINY, Ended, compose_job
 from tests.test_train import curves, equal, record
 
 Q = (
@@ -241,7 +241,6 @@ def start(folder: Path, *words: str, **variables: str) -> subprocess.Popen[str]:
     """Trains in a process group of its own."""
     environment = {
         **os.environ,
-        "PYTHONPATH": f"{REPOSITORY / 'src'}{os.pathsep}{REPOSITORY}",
         "OMP_NUM_THREADS": "1",
         "TINY_PAUSE": "0.2",
     }

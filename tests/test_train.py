@@ -20,7 +20,7 @@ from filelock import FileLock
 
 from apex_lab.runs import checkpoints
 from apex_lab.train import main
-from tests.conftest import REPOSITORY, TINY, Ended
+from tests.conftest import TINY, Ended
 
 LONG = ("trainer.max_steps=60", "trainer.checkpoint_interval=7", "trainer.validation_interval=20")
 """Enough steps to be killed among."""
@@ -47,7 +47,6 @@ def start(folder: Path, *words: str, code: str = "from apex_lab.train import mai
     """Trains the tiny model in a process of its own, which can be killed."""
     environment = {
         **os.environ,
-        "PYTHONPATH": f"{REPOSITORY / 'src'}{os.pathsep}{REPOSITORY}",
         "OMP_NUM_THREADS": "1",
         "TINY_PAUSE": "0.2",
     }
@@ -155,9 +154,8 @@ def test_an_unexpected_error_is_recorded(
     assert "the data broke" in (the_run() / "log.txt").read_text()
 
 
-def test_two_processes_cannot_have_the_same_run(train: Callable[..., Ended], the_run: Callable[..., Path]) -> None:
-    train()
-    with FileLock(str(the_run() / ".lock")):
+def test_two_processes_cannot_have_the_same_run(train: Callable[..., Ended], trained: Path) -> None:
+    with FileLock(str(trained / ".lock")):
         ended = train()
     assert ended.code == 1
     assert "is being worked on by another process: wait for it or stop it." in ended.err
@@ -247,9 +245,8 @@ def test_killed_while_writing_a_checkpoint(
     assert list(run.rglob("*.part")) == []
 
 
-@pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGTERM, 143), pytest.param(signal.SIGINT, 130, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+@pytest.mark.slow  # in the test's own process: tests/test_stops.py
 def test_asked_to_stop_it_stores_the_step_at_hand(
     number: signal.Signals, code: int, train: Callable[..., Ended], unbroken: Path, tmp_path: Path
 ) -> None:
@@ -338,16 +335,13 @@ def test_a_checkpoint_of_another_configuration_is_refused(
     assert len(ended.err.splitlines()) == 1
 
 
-def test_a_run_that_lost_its_curves_is_evaluated_without_their_page(
-    train: Callable[..., Ended], the_run: Callable[..., Path]
-) -> None:
-    assert train().code == 0
+def test_a_run_that_lost_its_curves_is_evaluated_without_their_page(train: Callable[..., Ended], trained: Path) -> None:
     for name in ("curves.csv", "metrics.json"):
-        (the_run() / name).unlink()
+        (trained / name).unlink()
     ended = train("evaluation.pictures=1")
     assert ended.code == 0, ended.err
-    assert (the_run() / "metrics.json").is_file()
-    assert not list(the_run().rglob("curves.png"))
+    assert (trained / "metrics.json").is_file()
+    assert not list(trained.rglob("curves.png"))
 
 
 def test_a_full_disk_is_told_and_the_checkpoint_before_stays(

@@ -32,7 +32,7 @@ from apex_lab.inference.predictor import Predictor
 from apex_lab.inference.sizes import fitted
 from apex_lab.runs import checkpoints
 from apex_lab.runs.folder import Outcome, Run, group_name, run_folder
-from apex_lab.runs.state import beating, read_state
+from apex_lab.runs.state import RunState, beating, read_state
 from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
 from apex_lab.training import estimate, ranks, worker
@@ -44,9 +44,12 @@ from apex_lab.training.loggers import Curves, Wandb, closing
 
 def main() -> None:
     """Entry point: `python -m apex_lab.train`."""
-    cli.launch(
-        cli.Command("train", check_job, train, title, known=lambda job: read_state(run_folder(job)), reseeded=reseeded)
-    )
+    cli.launch(cli.Command("train", check_job, train, title, known=_known, reseeded=reseeded))
+
+
+def _known(job: Job) -> RunState:
+    """A run as it stands; finished where `train` would find it so."""
+    return read_state(run_folder(job), job.config.evaluation.split)
 
 
 def title(job: Job) -> str:

@@ -74,28 +74,31 @@ def test_with_a_new_key_the_shipped_checkpoint_loads(command: Callable[..., Ende
 
 
 def test_a_finished_run_of_format_1_is_found_and_other_settings_are_not(
-    command: Callable[..., Ended], tmp_path: Path
+    command: Callable[..., Ended], tmp_path: Path, p2d_smoke: str
 ) -> None:
     shutil.copytree(OLD, tmp_path / "outputs" / OLD.name)
     ended = command("train", *WORDS)
     assert ended.code == 0, ended.err
     assert "finished already: outputs/apex_p2d_smoke_c2ea6a76/seed_0" in ended.out
-    ended = command("train", *WORDS, "optimizer.lr=1e-3", "trainer.max_steps=1", "trainer.validation_interval=null")
+    other = ("optimizer.lr=1e-3", "trainer.max_steps=1", "trainer.validation_interval=null")
+    ended = command("train", *WORDS, *other, p2d_smoke)
     assert ended.code == 0, ended.err
     assert "finished already" not in ended.out
 
 
-def test_a_checkpoint_of_format_1_gives_the_scores_that_it_gave(command: Callable[..., Ended], tmp_path: Path) -> None:
+def test_a_checkpoint_of_format_1_gives_the_scores_that_it_gave(
+    command: Callable[..., Ended], tmp_path: Path, p2d_smoke: str
+) -> None:
     before = json.loads((OLD / "seed_0" / "metrics.json").read_text())["splits"]["test"]
     shutil.copy(OLD / "seed_0" / "checkpoints" / "last.ckpt", tmp_path / "old.ckpt")
-    ended = command("evaluate", "checkpoint=old.ckpt", "folder=scores", "pictures=0")
+    ended = command("evaluate", "checkpoint=old.ckpt", "folder=scores", "pictures=0", p2d_smoke)
     assert ended.code == 0, ended.err
     after = json.loads((tmp_path / "scores" / "metrics.json").read_text())["splits"]["test"]
     for key in ("ari_fg", "msc_fg", "ari", "msc", "mota", "misses"):
         assert after["total"][key] == pytest.approx(before["total"][key], abs=1e-6), key
 
 
-def test_an_unfinished_run_of_format_1_resumes(command: Callable[..., Ended], tmp_path: Path) -> None:
+def test_an_unfinished_run_of_format_1_resumes(command: Callable[..., Ended], tmp_path: Path, p2d_smoke: str) -> None:
     run = tmp_path / "outputs" / OLD.name / "seed_0"
     shutil.copytree(OLD, run.parent)
     record = json.loads((run / "run.json").read_text())
@@ -103,7 +106,7 @@ def test_an_unfinished_run_of_format_1_resumes(command: Callable[..., Ended], tm
     (run / "metrics.json").unlink()
     content = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
     torch.save({**content, "step": 48}, run / "checkpoints" / "last.ckpt")
-    ended = command("train", *WORDS)
+    ended = command("train", *WORDS, p2d_smoke)
     assert ended.code == 0, ended.err
     assert "resuming from step 48" in ended.out
     assert json.loads((run / "run.json").read_text())["format"] == FORMAT

@@ -62,8 +62,13 @@ def test_own_truth_files_are_truth(tmp_path: Path, format: str, warned: list[str
     assert warned == []
 
 
-@pytest.mark.parametrize("format", FORMATS)
-@pytest.mark.parametrize("void", [255, 77, -1])
+@pytest.mark.parametrize(
+    ("format", "void"),
+    [
+        *((format, void) for format in FORMATS for void in (255, -1)),
+        *(pytest.param(format, 77, marks=() if format in ("npz", "mots") else pytest.mark.slow) for format in FORMATS),
+    ],
+)
 def test_an_ignored_label_in_every_format(tmp_path: Path, format: str, void: int, warned: list[str]) -> None:
     videos = some_videos(void)
     predictions = write("npz", tmp_path / "p.npz", videos)

@@ -13,6 +13,7 @@ import copy
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -20,6 +21,9 @@ from torch import Tensor
 
 from apex_lab.nn.noise import RankNoise, VideoNoise
 from apex_lab.scene import ABSENT, Context, Noise, Scene, SceneModel, Statistics, schedule_at
+
+SHORT = 3
+"""Frames that reach every part of a model: discovery, propagation, and propagation of what was propagated."""
 
 VIDEOS = 4
 """Videos of a batch: two ranks of two."""
@@ -99,6 +103,33 @@ class Case:
         chosen = list(range(VIDEOS) if videos is None else videos)
         return self.chunk(model.eval(), chosen, range(self.frames), None, **options)
 
+    @cached_property
+    def scene(self) -> Scene:
+        """Of the whole batch in evaluation; several checks look at it."""
+        return self.evaluate(self.ready())
+
+    @cached_property
+    def detailed(self) -> Scene:
+        """The same with `Context.detail`."""
+        return self.evaluate(self.ready(), detail=True)
+
+    @cached_property
+    def trained(self) -> Scene:
+        """Of the whole batch while training."""
+        video, labels = self.batch()
+        with torch.no_grad():
+            return call(self.ready(training=True), video, labels, self.context())
+
+    def short(self, values: Mapping[str, float], training: bool) -> Scene:
+        """The scene of the first frames of one video, at given values of the schedules; with its posterior."""
+        video, labels = (x[:1, :SHORT] for x in self.batch())
+        model, context = self.ready(training), Context(schedule_at(values), VideoNoise(0, range(1)), detail=True)
+        with torch.no_grad():
+            scene = call(model, video, labels, context)
+            if model.has_posterior and not training:
+                model.posterior(scene, video, context)
+        return scene
+
     def chunk(self, model: SceneModel, videos: list[int], frames: range, state: Any, **options: Any) -> Scene:
         """The scene of some frames, `state` being that of the frames before."""
         noise = VideoNoise(0, videos, frames.start)
@@ -133,7 +164,7 @@ def call(model: SceneModel, video: Tensor, labels: Tensor, context: Context) -> 
 
 def check_shapes(case: Case) -> None:
     """Every field has the shape and type of its annotation, and is finite and in its range."""
-    scene = case.evaluate(case.ready(), detail=True)
+    scene = case.detailed
     b, t, h, w = VIDEOS, case.frames, case.side, case.side
     k = scene.masks.shape[2]
     shapes: dict[str, tuple[int, ...]] = {
@@ -164,8 +195,7 @@ def check_shapes(case: Case) -> None:
 
 def check_masks_sum_to_one(case: Case) -> None:
     """At every pixel, while training and in evaluation; an absent component has no pixel."""
-    for training in (True, False):
-        scene = _scene(case, training)
+    for training, scene in ((True, case.trained), (False, case.scene)):
         error = float((scene.masks.sum(dim=2) - 1).abs().max())
         _require(error < 1e-4, case, f"masks sum to 1 but for {error} ({training=})")
         if not training and bool((scene.ids == ABSENT).any()):
@@ -175,7 +205,7 @@ def check_masks_sum_to_one(case: Case) -> None:
 
 def check_ids(case: Case) -> None:
     """No identity occurs twice in a frame; a background component always has one."""
-    scene = case.evaluate(case.ready())
+    scene = case.scene
     for frame in scene.ids.flatten(0, 1).tolist():
         there = [i for i in frame if i != ABSENT]
         _require(len(there) == len(set(there)), case, f"ids {frame} repeat within a frame")
@@ -184,8 +214,7 @@ def check_ids(case: Case) -> None:
 
 def check_detail(case: Case) -> None:
     """Costly fields are filled when they are asked for, and only then; the others do not change."""
-    model = case.ready()
-    plain, detailed = case.evaluate(model), case.evaluate(model, detail=True)
+    plain, detailed = case.scene, case.detailed
     for name in ("windows", "means"):
         _require(getattr(plain, name) is None, case, f"{name} is filled without Context.detail")
     _same(case, _without_detail(plain), _without_detail(detailed), "with and without Context.detail")
@@ -193,8 +222,8 @@ def check_detail(case: Case) -> None:
 
 def check_terms(case: Case) -> None:
     """Loss terms have the names of `term_names`, and a finite value per video."""
-    for training in (True, False):
-        terms = _scene(case, training).terms
+    for training, scene in ((True, case.trained), (False, case.scene)):
+        terms = scene.terms
         _require(
             set(terms) == set(case.model.term_names),
             case,
@@ -209,8 +238,7 @@ def check_posterior(case: Case) -> None:
     """Where there is a posterior over components, it is one: at every pixel it sums to 1."""
     if not case.model.has_posterior:
         return
-    model = case.ready()
-    scene, (video, _) = case.evaluate(model, detail=True), case.batch()
+    model, scene, (video, _) = case.ready(), case.detailed, case.batch()
     with torch.no_grad():
         found = model.posterior(scene, video, case.context(detail=True))
     _require(found.shape == scene.masks.shape, case, f"the posterior has the shape {tuple(found.shape)}")
@@ -226,13 +254,8 @@ def check_schedule_names(case: Case) -> None:
 
     def missed(values: Mapping[str, float], training: bool) -> str | None:
         """The first name that is not there when the model looks for it."""
-        video, labels = case.batch()
-        model, context = case.ready(training), Context(schedule_at(values), VideoNoise(0, range(VIDEOS)), detail=True)
         try:
-            with torch.no_grad():
-                scene = call(model, video, labels, context)
-                if model.has_posterior and not training:
-                    model.posterior(scene, video, context)
+            case.short(values, training)
         except KeyError as error:
             return str(error.args[0])
         return None
@@ -251,8 +274,7 @@ def check_schedule_ends(case: Case) -> None:
     for name, (low, high) in case.model.schedule_ranges.items():
         _require(low <= high, case, f"schedule_ranges[{name!r}] = {(low, high)} is empty")
         for value in (low, high):
-            ended = Case(case.model, case.frames, case.side, {**case.values(), name: value}, dtype=case.dtype)
-            for term, found in _scene(ended, training=True).terms.items():
+            for term, found in case.short({**case.values(), name: value}, training=True).terms.items():
                 _require(bool(found.isfinite().all()), case, f"term {term!r} is not finite at {name} = {value}")
 
 
@@ -275,7 +297,8 @@ def check_evaluation_repeats(case: Case) -> None:
     """A video has the same scene every time, and looking at it changes nothing in the model."""
     model = case.ready()
     before = copy.deepcopy(model.state_dict())
-    _same(case, case.evaluate(model), case.evaluate(model), "when evaluated a second time", tolerance=0.0)
+    first = case.evaluate(model)
+    _same(case, first, case.evaluate(model), "when evaluated a second time", tolerance=0.0)
     for name, value in model.state_dict().items():
         _require(torch.equal(value, before[name]), case, f"evaluation changed {name}")
 
@@ -283,22 +306,21 @@ def check_evaluation_repeats(case: Case) -> None:
 def check_order_of_videos(case: Case) -> None:
     """Videos in another order have the same scenes in that order."""
     model, order = case.ready(), [2, 0, 3, 1]
-    _same(case, case.evaluate(model, order), _videos(case.evaluate(model), order), "in another order")
+    _same(case, case.evaluate(model, order), _videos(case.scene, order), "in another order")
 
 
 def check_independent_of_batch(case: Case) -> None:
     """A video has the same scene alone as beside others."""
     model = case.ready()
-    together = case.evaluate(model)
     for video in range(VIDEOS):
-        _same(case, case.evaluate(model, [video]), _videos(together, [video]), "alone")
+        _same(case, case.evaluate(model, [video]), _videos(case.scene, [video]), "alone")
 
 
 def check_chunks(case: Case) -> None:
     """A video cut into chunks, each from the state of the one before, has the scene of the whole."""
     if not case.model.streams:
         return
-    model, whole, t = case.ready(), case.evaluate(case.ready()), case.frames
+    model, whole, t = case.ready(), case.scene, case.frames
     first = max(1, 3 * t // 7)
     for lengths in ([first, t - first], [1] * t):
         state, parts = None, []
@@ -417,12 +439,6 @@ def name_of(check: Check) -> str:
 def _require(holds: bool, case: Case, message: str) -> None:
     if not holds:
         raise AssertionError(f"{case.name}: {message}")
-
-
-def _scene(case: Case, training: bool) -> Scene:
-    video, labels = case.batch()
-    with torch.no_grad():
-        return call(case.ready(training), video, labels, case.context())
 
 
 def _fields(scene: Scene) -> dict[str, Tensor]:

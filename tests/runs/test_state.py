@@ -42,9 +42,32 @@ def test_states(record: dict[str, object], expected: str, tmp_path: Path) -> Non
 
 def test_a_finished_run_has_scores(tmp_path: Path) -> None:
     folder(tmp_path, status="finished", steps=7, seconds=2.5)
-    write_json(tmp_path / "metrics.json", {})
+    write_json(tmp_path / "metrics.json", {"splits": {"test": {"total": {"ari": 0.5}, "per_video": [{"ari": 0.5}]}}})
     found = read_state(tmp_path)
     assert (found.state, found.steps, found.seconds) == ("finished", 7, 2.5)
+    assert read_state(tmp_path, "test").state == "finished"
+    assert read_state(tmp_path, "val").state == "interrupted"
+
+
+@pytest.mark.parametrize(
+    ("text", "at_a_look"),
+    [
+        ('{"splits": {"test": {"total": {"ari": NaN}}}}\n', "finished"),  # as earlier versions wrote it
+        ('{"splits": {"test": {"total": {"ari": 0.5}}', "finished"),  # seen only by who reads all of it
+        ('{"splits": {"test": {"total": {"ari": 0.5', "interrupted"),
+        ('{"splits": {"test": {}}}', "finished"),
+        ('{"splits": 3}', "finished"),
+        ("", "interrupted"),
+        ("\0" * 100, "interrupted"),
+    ],
+)
+def test_results_are_whole(text: str, at_a_look: str, tmp_path: Path) -> None:
+    folder(tmp_path, status="finished")
+    (tmp_path / "metrics.json").write_text(text)
+    assert read_state(tmp_path).state == at_a_look
+    found = read_state(tmp_path, "test")
+    assert found.state == ("finished" if "NaN" in text else "interrupted")
+    assert found.reason == (None if "NaN" in text else "its metrics.json is damaged")
 
 
 def test_nothing_and_damage(tmp_path: Path) -> None:

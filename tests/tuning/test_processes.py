@@ -22,7 +22,7 @@ from optuna.trial import TrialState
 from apex_lab.base.files import read_json
 from apex_lab.tuning.storage import open_storage
 from apex_lab.tuning.trials import RETRY_OF, places
-from tests.conftest import REPOSITORY, TINY
+from tests.conftest import TINY
 
 pytestmark = [
     pytest.mark.slow,
@@ -105,7 +105,7 @@ def _start(folder: Path, storage: str | None, trials: int, pause: float) -> subp
     return subprocess.Popen(
         [sys.executable, "-m", "apex_lab.tune", *words],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": f"{REPOSITORY / 'src'}:{REPOSITORY}", "TINY_PAUSE": str(pause)},
+        env={**os.environ, "TINY_PAUSE": str(pause)},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

@@ -115,6 +115,13 @@ def test_every_end_and_choice_is_checked_before_the_first_trial(
     assert not (tmp_path / "outputs").exists()
 
 
+def test_a_time_limit_of_runs_is_none_of_a_study(tune: Callable[..., Ended], tmp_path: Path) -> None:
+    ended = tune("optimizer.lr=interval(1e-3,1e-2)", "trainer.max_minutes=5")
+    assert ended.code == 2
+    assert "trainer.max_minutes = 5 would end trials early: write study.max_minutes=5." in ended.err
+    assert not (tmp_path / "outputs").exists()
+
+
 @pytest.mark.slow
 def test_seeds_are_averaged_and_a_second_objective_makes_a_front(
     tune: Callable[..., Ended], the_study: Callable[[], optuna.Study], tmp_path: Path

@@ -12,7 +12,7 @@ from PIL import Image
 
 from apex_lab.base.errors import UserError
 from apex_lab.view import curve_page
-from apex_lab.view.curves import _panels, _read
+from apex_lab.view.curves import _panels, read_curves
 
 ROWS = (
     {"step": 1, "epoch": 0, "train/loss": 100, "train/nll": 90, "train/gradient_norm": 5},
@@ -33,7 +33,7 @@ def table(tmp_path: Path) -> Path:
 
 
 def test_panels_group_splits_and_numbers_in_reading_order(table: Path) -> None:
-    panels = _panels(_read(table))
+    panels = _panels(read_curves(table))
     assert list(panels) == ["loss", "ari_fg", "nll", "gradient_norm", "live_objects", "share", "temperature"]
     assert [label for label, _, _ in panels["loss"]] == ["train", "val"]
     assert [label for label, _, _ in panels["share"]] == ["0", "1"]
@@ -47,7 +47,7 @@ def test_panels_group_splits_and_numbers_in_reading_order(table: Path) -> None:
 
 def test_a_single_numbered_column_keeps_its_name(tmp_path: Path) -> None:
     (tmp_path / "curves.csv").write_text("step,train/kl_2,test/ari\n1,3.0,0.5\n")
-    assert set(_panels(_read(tmp_path / "curves.csv"))) == {"kl_2", "ari"}
+    assert set(_panels(read_curves(tmp_path / "curves.csv"))) == {"kl_2", "ari"}
 
 
 def test_page_is_a_picture_with_as_many_rows_as_needed(table: Path, tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from apex_lab.base.files import drafts, make_folder, read_json, set_aside, write
 from apex_lab.config.schema import Job
 from apex_lab.config.upgrades import FORMAT, fingerprint
 from apex_lab.runs import identity, provenance
-from apex_lab.runs.state import LOCK, RECORD
+from apex_lab.runs.state import LOCK, RECORD, RESULTS, has_scores
 
 
 def group_name(job: Job) -> str:
@@ -136,7 +136,7 @@ class Run:
 
     @property
     def metrics_file(self) -> Path:
-        return self.folder / "metrics.json"
+        return self.folder / RESULTS
 
     @property
     def curves_file(self) -> Path:
@@ -157,15 +157,7 @@ class Run:
     @property
     def finished(self) -> bool:
         """Whether everything was done and its results are there and whole."""
-        if self.record.get("status") != "finished" or not self.metrics_file.is_file():
-            return False
-        try:
-            splits = read_json(self.metrics_file).get("splits")
-        except UserError:
-            return False
-        if not isinstance(splits, dict) or self.job.config.evaluation.split not in splits:
-            return False
-        return all(isinstance(scored, dict) and isinstance(scored.get("total"), dict) for scored in splits.values())
+        return self.record.get("status") == "finished" and has_scores(self.folder, self.job.config.evaluation.split)
 
     def start(self, command: str, device: torch.device) -> None:
         """Records that work begins or resumes, and with what."""

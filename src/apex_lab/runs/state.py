@@ -16,11 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
+
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.processes import alive
 
 RECORD = "run.json"
+RESULTS = "metrics.json"
 LOCK = ".lock"
 
 BEAT = 20.0
@@ -65,8 +68,14 @@ class RunState:
         return f"process {self.record.get('pid')} on {self.record.get('host')}"
 
 
-def read_state(folder: Path) -> RunState:
-    """The state of a run folder; damage becomes a state, never an exception."""
+def read_state(folder: Path, split: str | None = None) -> RunState:
+    """The state of a run folder; damage becomes a state, never an exception.
+
+    Args:
+        folder: of the run; need not exist.
+        split: whose scores a finished run must have, as `has_scores` reads them. None: metrics.json only needs an end,
+            for a look at thousands of runs whose results may lie on another machine.
+    """
     file = folder / RECORD
     if not file.is_file():
         return RunState(folder, "waiting", None, {})
@@ -76,19 +85,56 @@ def read_state(folder: Path) -> RunState:
         return RunState(folder, "damaged", str(error), {})
     if not isinstance(record, dict):
         return RunState(folder, "damaged", f"{file} holds no record of a run.", {})
-    state, reason = _state(folder, record)
+    state, reason = _state(folder, record, split)
     return RunState(folder, state, reason, record)
 
 
-def _state(folder: Path, record: dict[str, Any]) -> tuple[State, str | None]:
+class _Split(msgspec.Struct):
+    """What every split of a whole metrics.json has; rows per video, nearly all of the file, are not even built."""
+
+    total: dict[str, Any]
+
+
+class _Results(msgspec.Struct):
+    splits: dict[str, _Split]
+
+
+_DECODER = msgspec.json.Decoder(_Results)
+
+
+def has_scores(folder: Path, split: str) -> bool:
+    """Whether a run folder holds a whole metrics.json with the scores of a split."""
+    file = folder / RESULTS
+    try:
+        return split in _DECODER.decode(file.read_bytes()).splits
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        pass
+    try:  # of an earlier version, with NaN
+        splits = msgspec.convert(read_json(file), _Results).splits
+    except (UserError, msgspec.MsgspecError, RecursionError):
+        return False
+    return split in splits
+
+
+def _has_end(file: Path) -> bool:
+    """Whether a JSON file of a dictionary is there and was not cut off."""
+    try:
+        with open(file, "rb") as opened:
+            opened.seek(max(0, file.stat().st_size - 8))
+            return opened.read().rstrip().endswith(b"}")
+    except OSError:
+        return False
+
+
+def _state(folder: Path, record: dict[str, Any], split: str | None) -> tuple[State, str | None]:
     status, outcome, reason = record.get("status"), record.get("outcome"), record.get("reason")
     reason = reason if isinstance(reason, str) else None
     if status == "running":
         return ("running", None) if _alive(folder, record) else ("lost", "its process died without a word")
     if status == "finished":
-        if (folder / "metrics.json").is_file():
+        if has_scores(folder, split) if split is not None else _has_end(folder / RESULTS):
             return "finished", None
-        return "interrupted", "its metrics.json is gone"
+        return "interrupted", f"its {RESULTS} is {'damaged' if (folder / RESULTS).is_file() else 'gone'}"
     if status == "paused" or outcome == "paused":
         return "paused", reason
     if outcome == "interrupted":

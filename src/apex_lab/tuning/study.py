@@ -202,8 +202,6 @@ def _refuse(fixed: Sequence[str], parameters: Sequence[Parameter]) -> None:
             raise UserError(f"{word}: the seeds of a study are study.seeds=[{value}].")
         if key == "evaluation.split" and value != SPLIT:
             raise UserError(f"{word}: settings are chosen on validation videos alone: leave it out.")
-        if key == "trainer.max_minutes" and value != "null":
-            raise UserError(f"{word} would end trials early: write study.max_minutes={value}.")
 
 
 def _check_base(study: Study) -> None:
@@ -211,6 +209,11 @@ def _check_base(study: Study) -> None:
     job, scores = study.base, study.asked.study.scores
     if job.config.evaluation.split != SPLIT:  # an experiment chose another
         raise UserError(f"evaluation.split is '{job.config.evaluation.split}': write evaluation.split={SPLIT}.")
+    minutes = job.config.trainer.max_minutes
+    if minutes is not None:
+        raise UserError(
+            f"trainer.max_minutes = {minutes:g} would end trials early: write study.max_minutes={minutes:g}."
+        )
     model = build_model(job.config)
     if not model.needs_training:
         raise UserError(f"model={job.choices.get('model')} is not trained, so nothing can be pruned or tuned.")
