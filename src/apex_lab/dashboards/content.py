@@ -13,6 +13,7 @@ from pathlib import Path
 
 from hydra import compose
 
+import apex_lab
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import validate
 from apex_lab.config import command_line as cli
@@ -75,14 +76,10 @@ class Content:
     @property
     def commands(self) -> list[str]:
         """What was asked for, as it can be typed again."""
-        train = f"python -m apex_lab.train {typed(self.words)} logger=wandb"
-        if len(self.runs) > 1:
-            train += " -m"
-        return [
-            train,
-            f"python -m apex_lab.tables {typed(self.words)}",
-            f"python -m apex_lab.status {typed(self.words)}",
-        ]
+        words = typed(self.words)
+        logged = [] if any(word.lstrip("+").startswith("logger") for word in self.words) else ["logger=wandb"]
+        train = " ".join(["python -m apex_lab.train", words, *logged, *(["-m"] if len(self.runs) > 1 else [])])
+        return [train, f"python -m apex_lab.status {words}", f"python -m apex_lab.tables {words}"]
 
 
 def read_content(words: Sequence[str], jobs: Sequence[Listed], config_dir: str | None = None) -> Content:
@@ -100,11 +97,7 @@ def read_content(words: Sequence[str], jobs: Sequence[Listed], config_dir: str |
     except UserError:  # the jobs have no row in a table
         made = Made((), ())
     commit, dirty = provenance.commit()
-    version = (
-        f"commit {commit}{' with changes' if dirty else ''}"
-        if commit
-        else f"version {provenance.versions()['apex_lab']}"
-    )
+    version = f"{apex_lab.__version__}{f', commit {commit}' if commit else ''}{' with changes' if dirty else ''}"
     return Content(
         title=title(words),
         words=tuple(words),

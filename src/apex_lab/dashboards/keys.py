@@ -8,7 +8,7 @@ models are in curves.csv once a run has begun.
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import NamedTuple
 
 from apex_lab.metrics.keys import VALIDATION_SCORES
@@ -88,7 +88,7 @@ class Topics(NamedTuple):
     tables: list[str]
 
 
-def topics(jobs: Sequence[Listed], tracking: Iterable[str]) -> Topics:
+def topics(jobs: Sequence[Listed], tracking: Collection[str]) -> Topics:
     """What any of the jobs logs, in the order of the jobs and without repetition.
 
     Args:
@@ -100,7 +100,7 @@ def topics(jobs: Sequence[Listed], tracking: Iterable[str]) -> Topics:
     for job in jobs:
         if job.name not in seen:
             seen.add(job.name)
-            found.update(dict.fromkeys(_of_configuration(job, job.choices.get("model") in tracking)))
+            found.update(dict.fromkeys(_of_configuration(job, job.choices.get("model", "") in tracking)))
     for job in _one_with_curves(jobs):
         found.update(dict.fromkeys(columns(job)))
 
@@ -109,7 +109,7 @@ def topics(jobs: Sequence[Listed], tracking: Iterable[str]) -> Topics:
 
     named = {f"diagnostics/{name}" for name in (*OBJECTS, *PRESENCE)}
     shown = [job for job in jobs if job.raw["evaluation"]["pictures"]]
-    tracks = any(job.choices.get("model") in tracking for job in jobs)
+    tracks = any(job.choices.get("model", "") in tracking for job in jobs)
     splits = list(dict.fromkeys(str(job.raw["evaluation"]["split"]) for job in jobs))
     drawn = list(dict.fromkeys(str(job.raw["evaluation"]["split"]) for job in shown))
     final = [name for name in VALIDATION_SCORES if tracks or name not in TRACKING_SCORES]

@@ -24,7 +24,7 @@ COLOURS = (("#440154", 0), ("#21918c", 50), ("#fde725", 100))
 Named = TypeVar("Named")
 
 
-def curves(keys: Iterable[str], configurations: int, place: str) -> list[wr.LinePlot]:
+def curves(keys: Iterable[str], runs: int, place: str) -> list[wr.LinePlot]:
     """A panel per value: mean over the seeds of each configuration, with their standard deviation."""
     return [
         fixed(
@@ -36,7 +36,7 @@ def curves(keys: Iterable[str], configurations: int, place: str) -> list[wr.Line
                 groupby=GROUP,
                 groupby_aggfunc="mean",
                 groupby_rangefunc="stddev",
-                max_runs_to_show=configurations,
+                max_runs_to_show=runs,
             ),
             place,
             key,
@@ -82,7 +82,6 @@ def bars(keys: Iterable[str], configurations: int, place: str) -> list[wr.BarPlo
                 groupby=GROUP,
                 groupby_aggfunc="mean",
                 groupby_rangefunc="stddev",
-                max_runs_to_show=configurations,
                 max_bars_to_show=configurations,
             ),
             place,

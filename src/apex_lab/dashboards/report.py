@@ -33,8 +33,9 @@ def build(content: Content, entity: str, project: str) -> wr.Report:
 
 def blocks(content: Content) -> list[Any]:
     """All blocks in their order."""
-    topics, several = content.topics, len(content.rows)
+    topics, runs, several = content.topics, len(content.runs), len(content.rows)
     found: list[Any] = [wr.TableOfContents()]
+    drawn: Sequence[Any]
     found += [wr.CalloutBlock(text=remark) for remark in content.remarks]
     found += [wr.H2(text="What was asked"), wr.MarkdownBlock(text=_shell(content.commands)), _overview(content)]
     if content.tables:
@@ -44,12 +45,12 @@ def blocks(content: Content) -> list[Any]:
         ]
         found += [wr.MarkdownBlock(text=table.replace("## ", "### ", 1)) for table in content.tables]
     if topics.scores or topics.losses:
-        drawn = panels.curves([*topics.scores, *topics.losses], several, "curves")
+        drawn = panels.curves([*topics.scores, *topics.losses], runs, "curves")
         found += [wr.H2(text="Curves: mean and standard deviation over seeds"), _grid(content, drawn, 3, 8, "curves")]
-        drawn = panels.seeds([*topics.scores, *topics.losses[:1]], len(content.runs), "seeds", grouped=False)
+        drawn = panels.seeds([*topics.scores, *topics.losses[:1]], runs, "seeds", grouped=False)
         found += [wr.H2(text="Curves: every seed"), _grid(content, drawn, 3, 8, "seeds", grouped=False)]
     if topics.objects or topics.presence:
-        drawn = panels.curves([*topics.objects, *topics.presence], several, "objects")
+        drawn = panels.curves([*topics.objects, *topics.presence], runs, "objects")
         found += [wr.H2(text="Live objects and presence"), _grid(content, drawn, 3, 8, "objects")]
     drawn = panels.bars(topics.final, several, "final")
     found += [wr.H2(text="Scores after training"), _grid(content, drawn, 3, 8, "final")]

@@ -41,15 +41,13 @@ class Sent:
 
 def definition(content: Content, entity: str, project: str) -> dict[str, Any]:
     """Workspace and report as the library sends them: its classes `View` and `ReportViewspec` as plain values."""
-    views = {
+    views: dict[str, Any] = {
         "workspace": workspace.build(content, entity, project),
         "report": report.build(content, entity, project),
     }
     # the library's `save` sends what its models dump in the same way
-    return {
-        name: json.loads(view._to_model().model_dump_json(by_alias=True, exclude_none=True))
-        for name, view in views.items()
-    }
+    dumps = {name: view._to_model().model_dump_json(by_alias=True, exclude_none=True) for name, view in views.items()}
+    return {name: json.loads(text) for name, text in dumps.items()}
 
 
 def size(content: Content) -> tuple[int, int]:
@@ -80,10 +78,10 @@ def send(content: Content, entity: str | None, project: str, folder: Path) -> li
     saved = _read(folder / SAVED)
     known = saved.setdefault(place, {})
     sent = []
-    for kind in ("report", "workspace"):
+    kinds: tuple[Kind, ...] = ("report", "workspace")
+    for kind in kinds:
         view, updated = _view(kind, content, entity, project, known.get(kind))
-        _asked(view.save)
-        known[kind] = _asked(lambda view=view: view.url)
+        known[kind] = _asked(lambda view=view: str(view.save().url))  # type: ignore[misc]
         write_json(folder / SAVED, saved)
         sent.append(Sent(kind, known[kind], updated))
     return sent
@@ -92,9 +90,8 @@ def send(content: Content, entity: str | None, project: str, folder: Path) -> li
 def known_urls(folder: Path, words: tuple[str, ...]) -> list[str]:
     """Where earlier workspaces and reports of the same words are."""
     saved = _read(folder / SAVED)
-    return [
-        url for place, urls in saved.items() if place.partition(": ")[2] == " ".join(words) for url in urls.values()
-    ]
+    same = [urls for place, urls in saved.items() if place.partition(": ")[2] == " ".join(words)]
+    return [url for urls in same for url in urls.values()]
 
 
 def _view(kind: Kind, content: Content, entity: str, project: str, url: str | None) -> tuple[Any, bool]:

@@ -42,10 +42,10 @@ def only(runs: Sequence[str]) -> Any:
 
 def sections(content: Content) -> list[ws.Section]:
     """All sections that have a panel; the first ones are open."""
-    topics, several = content.topics, len(content.rows)
+    topics, runs, several = content.topics, len(content.runs), len(content.rows)
 
     def lines(name: str, keys: Sequence[str], open: bool = True) -> tuple[str, list[Any], bool]:
-        return name, panels.curves(keys, several, name), open
+        return name, panels.curves(keys, runs, name), open
 
     every = "Every seed"
     found: list[tuple[str, list[Any], bool]] = [
@@ -57,7 +57,7 @@ def sections(content: Content) -> list[ws.Section]:
         lines("Learning rate and speed", topics.rates),
         ("Film strips", panels.media(topics.strips, "Film strips"), True),
         ("Movies", panels.media(topics.movies, "Movies"), False),
-        (every, panels.seeds([*topics.scores[:1], *topics.losses[:1]], len(content.runs), every, grouped=True), True),
+        (every, panels.seeds([*topics.scores[:1], *topics.losses[:1]], runs, every, grouped=True), True),
         lines("Terms of the loss on validation videos", topics.terms, False),
         lines("Schedules", topics.schedules, False),
         lines("Other diagnostics", topics.diagnostics, False),
