@@ -11,3 +11,9 @@ saving     sends both, and remembers where they are, so that the next time updat
 
 Only `panels`, `workspace`, `report` and `saving` import wandb-workspaces, an extra.
 """
+
+from __future__ import annotations
+
+from apex_lab.dashboards.asked import main
+
+__all__ = ["main"]

@@ -12,7 +12,6 @@ from typing import Any, Literal, TypeVar
 import wandb
 import wandb_workspaces.reports.v2 as wr
 import wandb_workspaces.workspaces as ws
-from pydantic import ValidationError
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json, write_json
@@ -121,8 +120,8 @@ def _found(load: Callable[[str], View], url: str | None) -> View | None:
         return _asked(lambda: load(url))
     except NotSent as error:
         cause = error.__cause__
-        # what the library raises where the answer holds no view
-        if isinstance(cause, ValueError | TypeError) and not isinstance(cause, ValidationError):
+        # what the library raises where the answer holds no view: of a workspace, and of a report
+        if type(cause) is TypeError or (type(cause) is ValueError and "not found" in str(cause)):
             return None
         raise
 
