@@ -20,6 +20,8 @@ class FakeServer:
         self.projects: list[str] = []
         self.down = self.full = False
         monkeypatch.setattr(wandb, "Api", self.api)
+        # the real Api obeys WANDB_SILENT
+        monkeypatch.setattr(wandb, "termlog", lambda text: None)
         monkeypatch.setattr(of_reports, "execute_graphql", self.answer)
         monkeypatch.setattr(of_workspaces, "execute_graphql", self.answer)
 

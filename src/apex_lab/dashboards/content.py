@@ -50,6 +50,7 @@ class Content:
     Attributes:
         title: of workspace and report.
         words: those of `apex_lab.train` that name the jobs.
+        config_dir: a further folder of configuration files.
         runs: names of their runs on Weights & Biases.
         rows: their configurations.
         topics: names of what they log.
@@ -63,6 +64,7 @@ class Content:
 
     title: str
     words: tuple[str, ...]
+    config_dir: str | None
     runs: tuple[str, ...]
     rows: tuple[Row, ...]
     topics: Topics
@@ -76,7 +78,7 @@ class Content:
     @property
     def commands(self) -> list[str]:
         """What was asked for, as it can be typed again."""
-        words = typed(self.words)
+        words = typed([*self.words, *(["--config-dir", self.config_dir] if self.config_dir else [])])
         logged = [] if any(word.lstrip("+").startswith("logger") for word in self.words) else ["logger=wandb"]
         train = " ".join(["python -m apex_lab.train", words, *logged, *(["-m"] if len(self.runs) > 1 else [])])
         return [train, f"python -m apex_lab.status {words}", f"python -m apex_lab.tables {words}"]
@@ -101,6 +103,7 @@ def read_content(words: Sequence[str], jobs: Sequence[Listed], config_dir: str |
     return Content(
         title=title(words),
         words=tuple(words),
+        config_dir=config_dir,
         runs=tuple(run_name(job) for job in jobs),
         rows=tuple(_rows(jobs)),
         topics=topics(jobs, tracking),
