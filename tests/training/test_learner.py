@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from apex_lab.base.errors import UserError
-from apex_lab.config.schema import VALIDATION_SCORES
+from apex_lab.metrics.keys import VALIDATION_SCORES
 from apex_lab.data import training_loader, whole_loader
 from apex_lab.evaluation.score import foreground_share
 from apex_lab.inference.sizes import as_float

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from apex_lab.training.loggers import Curves, credentials
+from apex_lab.base.wandb_account import credentials
+from apex_lab.training.loggers import Curves
 from tests.conftest import TINY, Ended
 from tests.test_train import start, wait_for_step
 from tests.training import wandb_file

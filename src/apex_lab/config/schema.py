@@ -16,11 +16,9 @@ from apex_lab.config import ablations, components
 from apex_lab.config.components import is_node
 from apex_lab.config.composition import Composed, conf_dir
 from apex_lab.data.source import VideoSource
+from apex_lab.metrics.keys import VALIDATION_SCORES
 from apex_lab.scene import SceneModel
 from apex_lab.training.schedules import Constant
-
-VALIDATION_SCORES = ("ari_fg", "msc_fg", "ari", "msc", "mota", "match")
-"""Scores that validation puts into the curves; those of tracking only for models that track."""
 
 
 class _Part(BaseModel):

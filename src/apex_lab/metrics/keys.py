@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+VALIDATION_SCORES = ("ari_fg", "msc_fg", "ari", "msc", "mota", "match")
+"""Scores that validation puts into the curves; those of tracking only for models that track."""
+
 Level = Literal["frame", "video", "total"]
 Number = int | float
 _ALL: tuple[Level, ...] = ("frame", "video", "total")

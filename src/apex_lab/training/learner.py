@@ -19,11 +19,11 @@ from torch import nn
 from torch.optim import Optimizer
 
 from apex_lab.base.errors import UserError
-from apex_lab.config.schema import VALIDATION_SCORES
 from apex_lab.data.video_set import VideoSet
 from apex_lab.evaluation.score import Tally, add_batch, video_set
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.inference.predictor import Batch, Predictor
+from apex_lab.metrics.keys import VALIDATION_SCORES
 from apex_lab.training.update import WeightUpdate, named_parameters, remember_rates
 
 

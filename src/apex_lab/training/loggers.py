@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-import netrc
 import os
 import re
 import secrets
@@ -13,7 +12,6 @@ from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
-from urllib.parse import urlsplit
 
 from lightning.pytorch.loggers import Logger
 
@@ -21,6 +19,7 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import set_aside, unwritable, write_text
 from apex_lab.base.validation import one_line
+from apex_lab.base.wandb_account import credentials
 from apex_lab.runs.folder import Run, group_name
 
 
@@ -265,18 +264,3 @@ def closing(loggers: list[Logger]) -> Iterator[list[Logger]]:
         for logger in loggers:
             if isinstance(logger, Wandb):
                 logger.close(failed)
-
-
-def credentials() -> bool:
-    """Whether wandb would find a key without asking: in the environment or in the netrc file."""
-    if os.environ.get("WANDB_API_KEY") or os.environ.get("WANDB_IDENTITY_TOKEN_FILE"):
-        return True
-    host = urlsplit(os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai")).hostname or ""
-    home = Path.home()
-    for path in (os.environ.get("NETRC"), home / ".netrc", home / "_netrc"):
-        if path and Path(path).is_file():
-            try:
-                return netrc.netrc(path).authenticators(host) is not None
-            except (netrc.NetrcParseError, OSError) as error:
-                console.warn(f"wandb: {path} cannot be read ({one_line(error)}).")
-    return False

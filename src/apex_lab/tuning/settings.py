@@ -10,7 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, sentence, validate
 from apex_lab.config import components
-from apex_lab.config.schema import VALIDATION_SCORES, PathsPart
+from apex_lab.config.schema import PathsPart
+from apex_lab.metrics.keys import VALIDATION_SCORES
 
 ELBO = "elbo"
 """The objective that needs no labels: minus the sum of the loss terms `nll` and `kl_*`, in nats per video."""
