@@ -136,7 +136,7 @@ def run(origin: Origin) -> str:
 
 
 def _end_orphan(origin: Origin) -> None:
-    """Ends a worker of joblib whose sweep was killed: it would wait for further jobs, and hold the sweep's output open."""
+    """Ends a worker of joblib whose sweep was killed, else it waits for jobs and holds the sweep's output open."""
     if multiprocessing.current_process().name.startswith("Loky") and not alive(origin.pid):
         os._exit(128 + signal.SIGTERM)
 
