@@ -332,23 +332,32 @@ EARLY = (
 )
 
 
+@pytest.fixture(scope="module")
+def stopped_early(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run that early stopping alone has stopped."""
+    folder = tmp_path_factory.mktemp("early")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.chdir(folder)
+        patched.setattr(sys, "argv", ["train", *TINY, *EARLY])
+        main()
+    return next(folder.glob("outputs/*/seed_0"))
+
+
 @pytest.mark.parametrize("stop", [7, 6, *(pytest.param(step, marks=pytest.mark.slow) for step in (1, 3, 9))])
 def test_early_stopping_stops_where_it_does_unbroken(
     stop: int,
     train: Callable[..., Ended],
     at: Callable[..., None],
     the_run: Callable[..., Path],
-    tmp_path: Path,
+    stopped_early: Path,
 ) -> None:
-    assert train(*EARLY, "paths.outputs=whole").code == 0
-    whole = next(tmp_path.glob("whole/*/seed_0"))
-    assert (record(whole)["status"], record(whole)["steps"]) == ("finished", 9)
+    assert (record(stopped_early)["status"], record(stopped_early)["steps"]) == ("finished", 9)
     at("train", 2 * stop, ask(signal.SIGTERM))
     assert train(*EARLY).code == 143
     stopped(the_run(), stop, "SIGTERM")
     assert train(*EARLY).code == 0
     assert record(the_run())["steps"] == 9
-    equal(the_run(), whole)
+    equal(the_run(), stopped_early)
 
 
 class Counting(L.Callback):

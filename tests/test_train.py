@@ -224,14 +224,8 @@ main()
 """
 
 
-@pytest.mark.parametrize(
-    ("function", "call"),
-    [
-        ("fsync", 40),
-        pytest.param("replace", 9, marks=pytest.mark.slow),
-        pytest.param("replace", 10, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.slow  # a kill elsewhere: above; a checkpoint that is not whole: below; files: tests/base/test_files.py
+@pytest.mark.parametrize(("function", "call"), [("fsync", 40), ("replace", 9), ("replace", 10)])
 def test_killed_while_writing_a_checkpoint(
     function: str, call: int, train: Callable[..., Ended], unbroken: Path, tmp_path: Path
 ) -> None:

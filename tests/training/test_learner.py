@@ -9,11 +9,11 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from apex_lab.base.errors import UserError
-from apex_lab.metrics.keys import VALIDATION_SCORES
 from apex_lab.data import training_loader, whole_loader
 from apex_lab.evaluation.score import foreground_share
 from apex_lab.inference.sizes import as_float
 from apex_lab.metrics import background_identities
+from apex_lab.metrics.keys import VALIDATION_SCORES
 from apex_lab.nn.noise import mixed
 from apex_lab.scene import Context, Scene, schedule_at
 from apex_lab.training.callbacks import LastValidation

@@ -86,7 +86,9 @@ def test_two_processes_train_what_one_trains(one_process: Path, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("kill", [pytest.param(signal.SIGKILL, marks=pytest.mark.slow), signal.SIGTERM])
-def test_killed_and_resumed_they_end_as_unbroken(one_process: Path, tmp_path: Path, kill: signal.Signals) -> None:
+def test_killed_and_resumed_they_end_as_unbroken(
+    one_process: Path, tmp_path: Path, kill: signal.Signals, command: Callable[..., Ended]
+) -> None:
     process = start(tmp_path, "trainer.devices=2", pause=0.1)
     for _ in range(2000):
         records = [json.loads(path.read_text()) for path in tmp_path.glob("outputs/*/seed_0/run.json")]
@@ -105,10 +107,9 @@ def test_killed_and_resumed_they_end_as_unbroken(one_process: Path, tmp_path: Pa
             break
         time.sleep(0.05)
     assert not _workers(tmp_path)
-    process = start(tmp_path, "trainer.devices=2")
-    out, errors = process.communicate(timeout=200)
-    assert process.returncode == 0, errors
-    assert "resuming from step" in out
+    ended = command("train", *WORDS, "trainer.devices=2")  # rank 0 in this process
+    assert ended.code == 0, ended.err
+    assert "resuming from step" in ended.out
     equal(tmp_path / "outputs", one_process)
     # the number of processes does not change the name of a run
     assert [path.name for path in (tmp_path / "outputs").iterdir()] == [path.name for path in one_process.iterdir()]

@@ -118,9 +118,10 @@ A mean over nothing is `null` and never enters another mean: rates without any t
 `linked` takes a segment for the one of the frame before that it is assigned to by the largest total IoU.
 
 ## 3. Tables
-One number per seed from the whole test set; then mean and standard deviation over seeds with ddof = 1. Rounded once,
-when printed. A seed has failed if its loss became non-finite, or if it gives objects less than 0.1 % or more than
-99.9 % of the validation pixels; failed seeds are left out where the table says so, with their number in the footnote.
+A row is a configuration that a sweep names, with the seeds that it names. One number per seed from the whole test set;
+then mean and standard deviation over seeds with ddof = 1. Rounded once, when printed. A seed has failed if its loss
+became non-finite, or if it gives objects less than 0.1 % or more than 99.9 % of the validation pixels; failed seeds are
+left out where the table says so, with their number in the footnote.
 
 ## 4. Beyond the paper
 `mbo` [8]: mean over the objects of a frame of the best IoU with any predicted mask. `miou`: objects and predicted
