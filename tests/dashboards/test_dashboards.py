@@ -123,7 +123,8 @@ def test_panels_name_what_a_run_logs(
     dashboards: Callable[..., Ended], command: Callable[..., Ended], tmp_path: Path
 ) -> None:
     words = ("trainer.max_steps=4", "evaluation.pictures=1")
-    assert command("train", *TINY[:-1], *words, "logger=wandb").code == 0
+    ended = command("train", *TINY[:-1], *words, "logger=wandb")
+    assert ended.code == 0, ended.err
     [file] = tmp_path.glob("outputs/*/seed_0/wandb/offline-run-*/run-*.wandb")
     records = wandb_file.records(file)
     logged = {key for row in wandb_file.history(records) for key in row} | set(wandb_file.summary(records))
