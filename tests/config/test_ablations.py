@@ -39,7 +39,7 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             f"model.glimpses._target_='{APEX}.FeatureGlimpses'",
         ),
         (("+ablation=no_entropy", "loss.mask_entropy=1.0"), "loss.mask_entropy=0.0", "loss.mask_entropy=1.0"),
-        (("+ablation=no_entropy", "~loss.mask_entropy"), "loss.mask_entropy=0.0", "without loss.mask_entropy"),
+        (("+ablation=no_entropy", "~loss.mask_entropy"), "loss.mask_entropy=0.0", "no loss.mask_entropy"),
         (
             ("+ablation=no_entropy", "loss.mask_entropy={_target_:apex_lab.training.schedules.Constant,value:2.0}"),
             "loss.mask_entropy=0.0",

@@ -172,6 +172,8 @@ def test_files_of_values_are_taken() -> None:
         ("model.name=${oc.env:HOME}", "may not hold 'model.name=${oc.env:HOME}'"),
         ("model.name='${oc.env:HOME}'", "may not hold"),
         ("model.grid=1,${oc.env:HOME}", "may not hold"),
+        ("+tuned@_global_=evil", "a choice has its own place"),
+        ("model@x=apex", "a choice has its own place"),
     ],
 )
 def test_words_of_a_file_do_nothing_but_set_values(word: str, told: str) -> None:
@@ -216,6 +218,33 @@ def test_hostile_files_of_the_command_line_run_nothing(
         assert len(ended.err.splitlines()) == 1
         assert not proof.exists()
         assert not (tmp_path / "outputs").exists()
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("+tuned@_global_=nested", "a choice of tuned has its own place: leave out @_global_."),
+        ("+ablation@_global_=gaussian", "a choice of ablation has its own place: leave out @_global_."),
+        ("+tuned=headed", "headed.yaml may not be put at hydra.run: write # @package _global_"),
+        ("+tuned=chooses", "chooses.yaml may only choose files of apex_lab, and model/mine.yaml lies elsewhere."),
+    ],
+)
+def test_choices_go_where_they_are_looked_at(
+    word: str, told: str, command: Callable[..., Ended], tmp_path: Path
+) -> None:
+    for name, text in {
+        "tuned/nested": "# @package _global_\ncallbacks: {x: {_target_: os.system, command: 'true'}}",
+        "tuned/headed": "# @package hydra.run\ndir: elsewhere",
+        "tuned/chooses": "# @package _global_\ndefaults: [{override /model: mine}]",
+        "model/mine": "_target_: os.system\ncommand: 'true'",
+    }.items():
+        file = tmp_path / "conf" / f"{name}.yaml"
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text)
+    ended = command("train", "--config-dir", str(tmp_path / "conf"), "scale=smoke", word)
+    assert ended.code == 2
+    assert told in ended.err
+    assert not (tmp_path / "elsewhere").exists()
 
 
 def test_the_config_yaml_of_a_run_folder_is_compared_and_never_built(

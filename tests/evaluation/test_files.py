@@ -75,11 +75,11 @@ DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "newer": (lambda file: change(file, lambda c: c.update(format=99)), "has format 99"),
     "another version's": (
         lambda file: change(file, lambda c: c["config"]["trainer"].update(speed=3)),
-        "was made by another version of apex_lab: Unknown key trainer.speed = 3",
+        "holds a configuration that this version of apex_lab refuses: Unknown key trainer.speed = 3",
     ),
     "another version's model": (
         lambda file: change(file, lambda c: c["config"]["model"].update(depth=3)),
-        "was made by another version of apex_lab: Unknown key model.depth = 3",
+        "holds a configuration that this version of apex_lab refuses: Unknown key model.depth = 3",
     ),
 }
 
@@ -251,3 +251,13 @@ def test_a_folder_of_somebody_else_takes_no_parts(tmp_path: Path) -> None:
     (tmp_path / "parts" / MARKER).touch()
     Parts(tmp_path / "link", 1).remove()
     assert (tmp_path / "parts" / "000000.npz").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("root", "trusted", "makes"), [("/data", False, True), ("/x", False, False), ("/x", True, True)]
+)
+def test_a_checkpoint_does_not_choose_where_data_are_made(root: str, trusted: bool, makes: bool) -> None:
+    stored = {"data": {"_target_": "x", "root": root, "generate": True}, "paths": {"data": "/data", "outputs": "o"}}
+    found = files.here(Path("a.ckpt"), stored, PathsPart(outputs="runs", data="mine"), trusted)["data"]
+    assert found["generate"] is makes
+    assert found["root"] == ("mine" if root == "/data" else root)

@@ -56,7 +56,7 @@ def check(raw: Mapping[str, Any], choices: Mapping[str, str], conf: Path) -> Non
 def _compare(raw: Mapping[str, Any], name: str, key: str, value: Any) -> None:
     found = _at(raw, key)
     if not _same(found, value):
-        _refuse(name, f"{key}={shown(value)}", f"without {key}" if found is _MISSING else f"{key}={shown(found)}")
+        _refuse(name, f"{key}={shown(value)}", f"no {key}" if found is _MISSING else f"{key}={shown(found)}")
 
 
 def _refuse(name: str, sets: str, found: str) -> None:

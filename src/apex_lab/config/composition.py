@@ -89,6 +89,10 @@ def chosen(runtime: Any) -> dict[str, str]:
     """
     choices = runtime.choices.items()
     found = {str(k): str(v) for k, v in choices if not str(k).startswith("hydra/") and v is not None}
+    for key in found:
+        group, elsewhere, package = key.partition("@")
+        if elsewhere:  # no check of a choice would see it
+            raise UserError(f"{key}={found[key]}: a choice of {group} has its own place: leave out @{package}.")
     folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
     if not any((folder / "recipe" / f"{found.get('recipe')}.yaml").is_file() for folder in folders):
         found.pop("recipe", None)
@@ -209,7 +213,25 @@ def _check_tuned(choices: Mapping[str, str], runtime: Any) -> None:
     folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
     for file in (folder / "tuned" / f"{choices['tuned']}.yaml" for folder in folders):
         if file.is_file():
-            trust.only_values(yaml.safe_load(file.read_text(encoding="utf-8")) or {}, str(file))
+            text = file.read_text(encoding="utf-8")
+            for package in _PACKAGE.findall(text):
+                if package != "_global_":
+                    raise UserError(f"{file} may not be put at {package}: write # @package _global_ and whole keys.")
+            content = yaml.safe_load(text) or {}
+            trust.only_values(content, str(file))
+            _check_shipped(content, folders, str(file))
+
+
+_PACKAGE = re.compile(r"^\s*#\s*@package\s+(\S+)", re.MULTILINE)
+
+
+def _check_shipped(content: Mapping[str, Any], folders: Sequence[Path], source: str) -> None:
+    """Refuses choices of a tuned file that lead to files which came along with it."""
+    for entry in content.get("defaults", []):
+        for key, word in entry.items() if isinstance(entry, Mapping) else ():
+            name = f"{key.rpartition(' ')[2].lstrip('/')}/{word}.yaml"
+            if any((folder / name).is_file() for folder in folders if folder.resolve() != conf_dir()):
+                raise UserError(f"{source} may only choose files of apex_lab, and {name} lies elsewhere.")
 
 
 def not_there(error: Exception) -> str | None:

@@ -129,7 +129,9 @@ def only_words(words: Iterable[str], source: str, known: Iterable[str] = ()) -> 
         _refuse_interpolation(word, source)
     for override in OverridesParser.create().parse_overrides(words):
         line = str(override.input_line)
-        key = re.sub(r"[/@].*", "", override.get_key_element().lstrip("+~"))
+        if "@" in override.get_key_element():
+            raise UserError(f"{source} may not hold {shown(line)}: a choice has its own place, so leave out the @.")
+        key = re.sub(r"/.*", "", override.get_key_element().lstrip("+~"))
         if override.is_sweep_override() and "_target_" in line:
             raise UserError(f"{source} may not hold {shown(line)}: write the values as a list.")
         value = None if override.is_delete() or override.is_sweep_override() else override.value()

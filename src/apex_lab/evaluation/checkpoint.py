@@ -71,7 +71,7 @@ def load(
         UserError: the file is no usable checkpoint, or the data's settings do not fit.
     """
     content = checkpoints.load(file, trusted)
-    stored = here(file, content["config"], paths)
+    stored = here(file, content["config"], paths, trusted)
     try:
         job = config.check_job(stored, content["choices"], to_train=False)
     except UserError as error:

@@ -69,7 +69,7 @@ def look(
     for file in files:
         try:
             content = _glance(file, trusted, _stamp(file))
-            stored = here(file, content["config"], paths)
+            stored = here(file, content["config"], paths, trusted)
             _checked(file, stored)
             if data:
                 components.check(data.instead_of(stored["data"]), "data")
@@ -79,8 +79,11 @@ def look(
     return good, bad
 
 
-def here(file: Path, stored: Mapping[str, Any], paths: config.PathsPart) -> dict[str, Any]:
+def here(file: Path, stored: Mapping[str, Any], paths: config.PathsPart, trusted: bool) -> dict[str, Any]:
     """The configuration of a checkpoint with the folders of this machine.
+
+    A checkpoint may name another folder for its data. What lies there is read; nothing is made there unless the file is
+    trusted, since its author would choose where this machine writes.
 
     Raises:
         UserError: it has no data or no folders.
@@ -89,12 +92,14 @@ def here(file: Path, stored: Mapping[str, Any], paths: config.PathsPart) -> dict
     if not isinstance(data, Mapping) or not isinstance(then, Mapping) or "_target_" not in data:
         raise UserError(f"{file} holds no whole configuration: use another checkpoint.")
     own = {key: paths.data if value == then.get("data") else value for key, value in data.items()}
+    if not trusted and own.get("root", paths.data) != paths.data:
+        own["generate"] = False
     return {**stored, "data": own, "paths": paths.model_dump()}
 
 
 def of_another_version(file: Path, error: UserError) -> UserError:
     """The sentence for a configuration that this version refuses."""
-    return UserError(sentence(f"{file} was made by another version of apex_lab: {one_line(error)}"))
+    return UserError(sentence(f"{file} holds a configuration that this version of apex_lab refuses: {one_line(error)}"))
 
 
 def listed(bad: Mapping[Path, str], count: int) -> str:
