@@ -205,10 +205,19 @@ def test_class_attributes() -> None:
     assert Gswm.input_size is None
 
 
-@pytest.mark.parametrize(("scale", "size"), [("paper", 128), ("cpu", 64), ("quickstart", 64), ("smoke", 32)])
-def test_recipes_fit_the_model(scale: str, size: int) -> None:
+@pytest.mark.parametrize(
+    ("size", "files"),
+    [
+        (128, ["paper"]),
+        (64, ["cpu", "cpu_for/p2d"]),
+        (64, ["cpu", "cpu_for/sprites"]),
+        (64, ["quickstart"]),
+        (32, ["smoke"]),
+    ],
+)
+def test_recipes_fit_the_model(size: int, files: list[str]) -> None:
     """Every scheduled value and loss term has an entry, and the model can be built and run."""
-    nodes = [OmegaConf.load(CONF / f) for f in ("model/gswm.yaml", f"recipe/gswm/{scale}.yaml")]
+    nodes = [OmegaConf.load(CONF / f) for f in ("model/gswm.yaml", *(f"recipe/gswm/{file}.yaml" for file in files))]
     config: Any = OmegaConf.to_container(OmegaConf.merge({"data": {"image_size": size}}, *nodes), resolve=True)
     components.check(config["model"], "model")
     model = instantiate(config["model"], _convert_="all").eval()

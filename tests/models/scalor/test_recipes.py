@@ -23,13 +23,22 @@ def merged(scale: str, *further: str) -> dict[str, Any]:
     return plain  # type: ignore[return-value]
 
 
-@pytest.mark.parametrize("scale", SIZES)
-def test_builds(scale: str) -> None:
-    config = merged(scale)
+@pytest.mark.parametrize(
+    ("scale", "further", "size"),
+    [
+        ("paper", [], FreeSize),
+        ("cpu", ["recipe/scalor/cpu_for/p2d.yaml"], FreeSize),
+        ("cpu", ["recipe/scalor/cpu_for/sprites.yaml"], AnchoredSize),
+        ("quickstart", [], FreeSize),
+        ("smoke", [], FreeSize),
+    ],
+)
+def test_builds(scale: str, further: list[str], size: type) -> None:
+    config = merged(scale, *further)
     components.check(config["model"], "model")
     model = components.build(config["model"], "model")
     assert isinstance(model, Scalor)
-    assert isinstance(model.objects.discovery.size, FreeSize)
+    assert isinstance(model.objects.discovery.size, size)
     assert set(config["loss"]) == set(Scalor.term_names)
     assert set(config["schedule"]) == set(Scalor.schedule_ranges)
 
