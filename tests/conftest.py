@@ -6,7 +6,6 @@ import importlib
 import logging
 import os
 import shutil
-import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ from jaxtyping import install_import_hook
 from omegaconf import OmegaConf
 
 import tests.typechecked
+from tests.interrupts import hear_ctrl_c
 
 # Shapes and types of every call are checked in all tests; so the hook comes before the first import of apex_lab.
 install_import_hook("apex_lab", f"{tests.typechecked.__name__}.checked")
@@ -27,9 +27,7 @@ install_import_hook("apex_lab", f"{tests.typechecked.__name__}.checked")
 from apex_lab.config.composition import conf_dir, plain  # noqa: E402
 from apex_lab.config.schema import Job, check_job  # noqa: E402
 
-# A shell without job control starts background jobs deaf to Ctrl-C, and processes that tests start would inherit that.
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
+hear_ctrl_c()
 
 # A slow or busy machine is no flaw of what is tested.
 hypothesis.settings.register_profile("no deadline", deadline=None)
