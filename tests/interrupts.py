@@ -1,4 +1,4 @@
-"""A shell without job control starts background jobs deaf to Ctrl-C, and processes that tests start would inherit that."""
+"""A shell without job control starts background jobs deaf to Ctrl-C, and what tests start would inherit that."""
 
 from __future__ import annotations
 
