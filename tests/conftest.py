@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib
+import json
 import logging
 import os
 import shutil
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -123,14 +125,28 @@ def the_run(tmp_path: Path) -> Callable[..., Path]:
     return find
 
 
-@pytest.fixture(scope="session")
-def _outputs_of_one_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("one_run")
+def train_in(folder: Path, *words: str) -> Path:
+    """Trains in this process and a folder, for fixtures that several tests share; the folder of outputs."""
     with pytest.MonkeyPatch.context() as patched:
         patched.chdir(folder)
-        patched.setattr(sys, "argv", ["train", *TINY])
+        patched.setattr(sys, "argv", ["train", *words])
         importlib.import_module("apex_lab.train").main()
     return folder / "outputs"
+
+
+def wait_for_step(folder: Path, step: int) -> Path:
+    """Waits until the run of seed 0 below a folder has stored a step; the run's folder."""
+    for _ in range(6000):
+        for file in folder.glob("outputs/*/seed_0/run.json"):
+            if json.loads(file.read_text())["steps"] >= step:
+                return file.parent
+        time.sleep(0.01)
+    raise AssertionError("the run did not get so far")
+
+
+@pytest.fixture(scope="session")
+def _outputs_of_one_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return train_in(tmp_path_factory.mktemp("one_run"), *TINY)
 
 
 @pytest.fixture

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import json
 import os
@@ -17,6 +16,7 @@ from typing import Any
 import pytest
 import torch
 
+from apex_lab.base.processes import alive
 from tests.conftest import TINY
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
@@ -118,13 +118,6 @@ def stored(folder: Path, seed: int) -> int:
     """Step of a run's last checkpoint."""
     [file] = folder.glob(f"outputs/*/seed_{seed}/checkpoints/last.ckpt")
     return int(torch.load(file, weights_only=True)["step"])
-
-
-def alive(pid: int) -> bool:
-    with contextlib.suppress(ProcessLookupError):
-        os.kill(pid, 0)
-        return "Z" not in Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    return False
 
 
 def test_failures_end_no_other_job_and_are_listed(launcher: str, sweep: Callable[..., Swept], tmp_path: Path) -> None:

@@ -17,9 +17,8 @@ import pytest
 import torch
 
 from apex_lab.runs import checkpoints
-from apex_lab.train import main
 from tests import tiny
-from tests.conftest import TINY, Ended, compose_job
+from tests.conftest import TINY, Ended, compose_job, train_in, wait_for_step
 from tests.test_train import curves, equal, record
 
 Q = (
@@ -52,12 +51,7 @@ CLUSTERS = {
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run that nothing stops."""
-    folder = tmp_path_factory.mktemp("unbroken")
-    with pytest.MonkeyPatch.context() as patched:
-        patched.chdir(folder)
-        patched.setattr(sys, "argv", ["train", *TINY, *Q])
-        main()
-    return next(folder.glob("outputs/*/seed_0"))
+    return next(train_in(tmp_path_factory.mktemp("unbroken"), *TINY, *Q).glob("*/seed_0"))
 
 
 @pytest.fixture
@@ -255,15 +249,6 @@ def start(folder: Path, *words: str, **variables: str) -> subprocess.Popen[str]:
     )
 
 
-def wait_for_step(folder: Path, step: int) -> Path:
-    for _ in range(6000):
-        for file in folder.glob("outputs/*/seed_0/run.json"):
-            if record(file.parent)["steps"] >= step:
-                return file.parent
-        time.sleep(0.01)
-    raise AssertionError("the run did not get so far")
-
-
 @pytest.mark.slow
 def test_a_signal_to_all_processes_of_a_job_stores_the_step_too(
     train: Callable[..., Ended], unbroken: Path, tmp_path: Path
@@ -335,12 +320,7 @@ EARLY = (
 @pytest.fixture(scope="module")
 def stopped_early(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The run that early stopping alone has stopped."""
-    folder = tmp_path_factory.mktemp("early")
-    with pytest.MonkeyPatch.context() as patched:
-        patched.chdir(folder)
-        patched.setattr(sys, "argv", ["train", *TINY, *EARLY])
-        main()
-    return next(folder.glob("outputs/*/seed_0"))
+    return next(train_in(tmp_path_factory.mktemp("early"), *TINY, *EARLY).glob("*/seed_0"))
 
 
 @pytest.mark.parametrize("stop", [7, 6, *(pytest.param(step, marks=pytest.mark.slow) for step in (1, 3, 9))])

@@ -20,7 +20,7 @@ from filelock import FileLock
 
 from apex_lab.runs import checkpoints
 from apex_lab.train import main
-from tests.conftest import TINY, Ended
+from tests.conftest import TINY, Ended, wait_for_step
 
 LONG = ("trainer.max_steps=60", "trainer.checkpoint_interval=7", "trainer.validation_interval=20")
 """Enough steps to be killed among."""
@@ -58,16 +58,6 @@ def start(folder: Path, *words: str, code: str = "from apex_lab.train import mai
         stderr=subprocess.PIPE,
         text=True,
     )
-
-
-def wait_for_step(folder: Path, step: int) -> Path:
-    """Waits until a run has stored a step."""
-    for _ in range(6000):
-        for file in folder.glob("outputs/*/seed_0/run.json"):
-            if record(file.parent)["steps"] >= step:
-                return file.parent
-        time.sleep(0.01)
-    raise AssertionError("the run did not get so far")
 
 
 def test_a_run_leaves_everything_and_says_so(train: Callable[..., Ended], the_run: Callable[..., Path]) -> None:

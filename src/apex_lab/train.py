@@ -24,6 +24,7 @@ from apex_lab.base.interrupts import Interrupted, deferring, interruptible
 from apex_lab.base.validation import one_line
 from apex_lab.config import command_line as cli
 from apex_lab.config import components, trust
+from apex_lab.config.composition import CHOICES
 from apex_lab.config.schema import Job, build_model, build_schedules, check_job, reseeded
 from apex_lab.config.schema import device as device_of
 from apex_lab.config.upgrades import fingerprint
@@ -252,7 +253,7 @@ def _checkpoint(run: Run) -> dict[str, Any] | None:
 def _compare_configuration(run: Run, checkpoint: dict[str, Any]) -> None:
     """Refuses to resume from the weights of another configuration, which may have the very same shapes."""
     if fingerprint(checkpoint["config"]) != fingerprint(run.job.raw):
-        other = " ".join(f"{key}={word}" for key, word in checkpoint["choices"].items() if key in cli.CHOICES)
+        other = " ".join(f"{key}={word}" for key, word in checkpoint["choices"].items() if key in CHOICES)
         raise UserError(
             f"The checkpoint in {run.folder} was made with another configuration ({other or 'no choices stored'}): "
             "put the run's own checkpoint back, or remove the folder to start again."

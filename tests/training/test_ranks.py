@@ -16,9 +16,8 @@ import pytest
 import torch
 
 from apex_lab.base.errors import UserError
-from apex_lab.train import main
 from apex_lab.training.ranks import Ranks, check_given, given, started
-from tests.conftest import TINY, Ended
+from tests.conftest import TINY, Ended, train_in
 
 WORDS = (
     *TINY,
@@ -54,12 +53,7 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
 
 @pytest.fixture(scope="module")
 def one_process(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("one")
-    with pytest.MonkeyPatch.context() as patched:
-        patched.chdir(folder)
-        patched.setattr(sys, "argv", ["train", *WORDS])
-        main()
-    return folder / "outputs"
+    return train_in(tmp_path_factory.mktemp("one"), *WORDS)
 
 
 def equal(ours: Path, theirs: Path) -> None:

@@ -16,7 +16,7 @@ from hydra import compose
 import apex_lab
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import validate
-from apex_lab.config import command_line as cli
+from apex_lab.config import preflight
 from apex_lab.config.composition import composing, plain
 from apex_lab.config.job_list import sweeps
 from apex_lab.dashboards.keys import Topics, topics
@@ -154,7 +154,7 @@ def _tables(
     with composing(()):
         settings = validate(TablesConfig, plain(compose("tables")), "")
     assert isinstance(settings, TablesConfig)
-    numbers = cli.sweep_tables(words, config_dir) if sweeps(words) else None
+    numbers = preflight.sweep_tables(words, config_dir) if sweeps(words) else None
     return Tables(
         settings, tuple(words), tuple(jobs), None if numbers is None else tuple(numbers), specification, config_dir
     )

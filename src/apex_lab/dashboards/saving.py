@@ -95,20 +95,15 @@ def known_urls(folder: Path, words: tuple[str, ...]) -> list[str]:
 
 def _view(kind: Kind, content: Content, entity: str, project: str, url: str | None) -> tuple[Any, bool]:
     """The workspace or report to save, and whether it stands in place of an earlier one."""
-    if kind == "report":
-        made = report.build(content, entity, project)
-        old_report = _found(wr.Report.from_url, url)
-        if old_report is None:
-            return made, False
-        for name in ("title", "description", "width", "blocks"):
-            setattr(old_report, name, getattr(made, name))
-        return old_report, True
-    new = workspace.build(content, entity, project)
-    old = _found(ws.Workspace.from_url, url)
+    build, load, parts = {
+        "report": (report.build, wr.Report.from_url, ("title", "description", "width", "blocks")),
+        "workspace": (workspace.build, ws.Workspace.from_url, ("name", "settings", "runset_settings", "sections")),
+    }[kind]
+    new, old = build(content, entity, project), _found(load, url)
     if old is None:
         return new, False
-    for name in ("name", "settings", "runset_settings", "sections"):
-        setattr(old, name, getattr(new, name))
+    for part in parts:
+        setattr(old, part, getattr(new, part))
     return old, True
 
 

@@ -26,7 +26,7 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_text
 from apex_lab.base.validation import sentence, validate
-from apex_lab.config import command_line as cli
+from apex_lab.config import preflight
 from apex_lab.config.composition import CHOICES, composing, conf_dir, plain
 from apex_lab.config.reader import Reader, ending
 from apex_lab.report.assemble import Asked, assemble
@@ -81,7 +81,7 @@ def write(words: Sequence[str], config_dir: str | None = None) -> Path:
     jobs = listed(rest, config_dir)
     numbers = settings.tables
     if numbers is None and any(_key(word) == "sweep" for word in rest):
-        found = cli.sweep_tables(rest, config_dir)
+        found = preflight.sweep_tables(rest, config_dir)
         numbers = None if found is None else tuple(found)
     asked_tables = Tables(
         asked=settings,

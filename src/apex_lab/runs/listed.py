@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from apex_lab.config import command_line as cli
+from apex_lab.config import preflight
 from apex_lab.config.upgrades import EXCLUDED
 from apex_lab.runs.identity import Outputs, group_name, run_folder
 from apex_lab.runs.state import RunState, read_state
@@ -72,7 +72,7 @@ def listed(words: Sequence[str], config_dir: str | None = None) -> list[Listed]:
     """
     found: dict[Path, Listed] = {}
     outputs: dict[str, Outputs] = {}
-    for made in cli.listed(words, config_dir):
+    for made in preflight.listed(words, config_dir):
         where = str(made.raw["paths"]["outputs"])
         place = outputs.setdefault(where, Outputs(Path(where)))
         folder = run_folder(place, made.identity, made.choices, made.raw["seed"])
@@ -92,7 +92,7 @@ def _check_unstarted(jobs: Sequence[Listed]) -> None:
     for job in jobs:
         unseen = bool(job.changes) and job.changes not in started | checked
         if unseen or not isinstance(job.raw["seed"], int) or job.raw["seed"] < 0:
-            cli.check_training(job.raw, job.choices, job.words)
+            preflight.check_training(job.raw, job.choices, job.words)
             checked.add(job.changes)
 
 

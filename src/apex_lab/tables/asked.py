@@ -22,6 +22,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json, write_text
 from apex_lab.base.validation import did_you_mean, shown, validate
 from apex_lab.config import command_line as cli
+from apex_lab.config import preflight
 from apex_lab.config.composition import CHOICES, composing, plain
 from apex_lab.config.job_list import sweeps
 from apex_lab.config.reader import Reader, ending
@@ -159,7 +160,7 @@ def asked(words: Sequence[str], config_dir: str | None = None) -> Tables:
     for model in settings.exclude_failed:
         if model not in models:
             raise UserError(f"exclude_failed: there is no model '{model}' in {', '.join(models)}.")
-    found = settings.tables or cli.sweep_tables(rest, config_dir)
+    found = settings.tables or preflight.sweep_tables(rest, config_dir)
     return Tables(
         settings, tuple(rest), tuple(jobs), None if found is None else tuple(found), specification, config_dir
     )
@@ -184,7 +185,7 @@ def assemble(job: Tables) -> Made:
         UserError: no job has a row in a table that was asked for.
     """
     changed = list(dict.fromkeys(plain_words(each) for each in job.jobs if each.changes))
-    found = dict(zip(changed, cli.plain_fingerprints(changed, job.config_dir), strict=True)) if changed else {}
+    found = dict(zip(changed, preflight.plain_fingerprints(changed, job.config_dir), strict=True)) if changed else {}
     rows = configurations(job.jobs, found)
     tables = []
     for table in job.specification.tables:

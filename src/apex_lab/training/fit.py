@@ -85,37 +85,13 @@ def fit(
         mode_of(config, device),
     )
     learner = Learner(update, optimizer, settings.log_interval, ranks.rank, ranks.world)
-    trainer = L.Trainer(
-        accelerator="gpu" if device.type == "cuda" else "cpu",
-        devices=settings.devices,
-        num_nodes=settings.num_nodes,
-        strategy=DDPStrategy(find_unused_parameters=_some_unused(config, update)) if ranks.world > 1 else "auto",
-        # Lightning's own precision: validation runs in it too; the step opens the same for itself
-        precision="bf16-mixed" if settings.precision == "bf16-mixed" else "32-true",
-        # this package starts all processes itself, or torchrun does; so no other cluster's variables count
-        plugins=[LightningEnvironment()],
-        max_epochs=1,
-        max_steps=settings.max_steps,
-        val_check_interval=settings.validation_interval,
-        check_val_every_n_epoch=None if settings.validation_interval is not None else 1,
-        limit_val_batches=None if settings.validation_interval is not None else 0,
-        num_sanity_val_steps=0,
-        log_every_n_steps=1,
-        logger=list(loggers),
-        callbacks=[
-            LastValidation(settings.max_steps),
-            *callbacks,
-            Lockstep(training.get("callbacks", {}) if training else {}, settings.max_steps, deadline),
-            *([keep] if keep is not None else []),
-        ],
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        use_distributed_sampler=False,
-        inference_mode=False,
-        default_root_dir=folder,
-    )
-    _ours_alone(trainer)
+    every = [
+        LastValidation(settings.max_steps),
+        *callbacks,
+        Lockstep(training.get("callbacks", {}) if training else {}, settings.max_steps, deadline),
+        *([keep] if keep is not None else []),
+    ]
+    trainer = _trainer(config, update, device, ranks, every, loggers, folder)
     resume_at(trainer, step)
     batches = training_loader(
         source,
@@ -140,6 +116,46 @@ def fit(
     if learner.stop:
         raise Interrupted(learner.stop)
     return learner.step >= settings.max_steps or trainer.should_stop
+
+
+def _trainer(
+    config: Config,
+    update: WeightUpdate,
+    device: torch.device,
+    ranks: Ranks,
+    callbacks: Sequence[L.Callback],
+    loggers: Sequence[Logger],
+    folder: Path | None,
+) -> L.Trainer:
+    """Lightning's trainer, with everything off that this package does itself."""
+    settings = config.trainer
+    trainer = L.Trainer(
+        accelerator="gpu" if device.type == "cuda" else "cpu",
+        devices=settings.devices,
+        num_nodes=settings.num_nodes,
+        strategy=DDPStrategy(find_unused_parameters=_some_unused(config, update)) if ranks.world > 1 else "auto",
+        # Lightning's own precision: validation runs in it too; the step opens the same for itself
+        precision="bf16-mixed" if settings.precision == "bf16-mixed" else "32-true",
+        # this package starts all processes itself, or torchrun does; so no other cluster's variables count
+        plugins=[LightningEnvironment()],
+        max_epochs=1,
+        max_steps=settings.max_steps,
+        val_check_interval=settings.validation_interval,
+        check_val_every_n_epoch=None if settings.validation_interval is not None else 1,
+        limit_val_batches=None if settings.validation_interval is not None else 0,
+        num_sanity_val_steps=0,
+        log_every_n_steps=1,
+        logger=list(loggers),
+        callbacks=list(callbacks),
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        inference_mode=False,
+        default_root_dir=folder,
+    )
+    _ours_alone(trainer)
+    return trainer
 
 
 def _ours_alone(trainer: L.Trainer) -> None:

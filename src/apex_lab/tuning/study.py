@@ -14,8 +14,7 @@ from typing import Any
 from hydra.core.override_parser.types import Quote, QuotedString
 
 from apex_lab.base.errors import UserError
-from apex_lab.config import command_line as cli
-from apex_lab.config import components
+from apex_lab.config import components, preflight
 from apex_lab.config.composition import CHOICES
 from apex_lab.config.schema import Job, build_model, check_job
 from apex_lab.config.upgrades import EXCLUDED, fingerprint
@@ -154,7 +153,7 @@ def check_study(
 
 
 def _job(words: Sequence[str]) -> Job:
-    job = cli.job_of("train", words, check_job)
+    job = preflight.job_of("train", words, check_job)
     assert isinstance(job, Job)
     return job
 
