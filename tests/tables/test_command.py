@@ -107,7 +107,7 @@ def test_values_that_a_configuration_has_anyway_make_the_same_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("apex_lab.config.command_line.check_training", lambda *_: None)  # which takes long
+    monkeypatch.setattr("apex_lab.config.preflight.check_training", lambda *_: None)  # which takes long
     words = ["+sweep=mine", "scale=cpu", "seed=0"]
     (job,) = asked(words, own).jobs
     frames = job.raw["data"]["frames"]
