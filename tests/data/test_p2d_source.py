@@ -13,9 +13,8 @@ import yaml
 
 from apex_lab.base.errors import UserError
 from apex_lab.config.schema import components, conf_dir
-from apex_lab.data import P2DSource, training_loader, whole_loader
+from apex_lab.data import P2DSource, recorded, training_loader, whole_loader
 from apex_lab.data import p2d_source as code
-from apex_lab.data import recorded
 from sims.p2d.settings import Settings
 from sims.p2d.store import fingerprint
 from tests.fakes.p2d_tools import FAKE
