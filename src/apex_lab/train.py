@@ -314,7 +314,7 @@ def _checkpoints(run: Run, training: dict[str, Any] | None, labelled: bool) -> o
     settings = run.job.config.trainer
     monitor, mode = settings.monitor, settings.monitor_mode
     if not labelled:
-        console.say("the videos have no labels, so there are no scores: look at the loss, the pictures and objects_present")
+        console.say("the videos have no labels, so there are no scores: look at loss, pictures and objects_present")
         if needs_labels(monitor):
             console.say(f"best.ckpt has the lowest val/loss, since {monitor} needs labels (trainer.monitor)")
             monitor, mode = "val/loss", "min"

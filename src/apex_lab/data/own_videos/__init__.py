@@ -1,1 +1,1 @@
-"""A person's own videos as a data set: looked at once, cut into clips, kept in a recording. Only `source` needs torch."""
+"""A person's own videos as a data set: looked at once, cut into clips, kept in a recording. `source` needs PyTorch."""

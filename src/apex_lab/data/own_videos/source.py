@@ -44,7 +44,7 @@ class OwnVideosSource(RecordedSource):
             `cutting.FEW` videos on.
         val_share, test_share: of the videos, or of the clips where they are split by time.
         workers: processes that load training clips; 0 loads in the training process.
-        prepare_workers: processes that cut clips; None: one per core.
+        prepare_workers: processes that cut clips; None: one per core; 0: the training process.
         verify: when to compare all bytes with their checksums, as for P2D.
 
     Raises:
@@ -70,7 +70,7 @@ class OwnVideosSource(RecordedSource):
         val_share: Annotated[float, Field(gt=0, lt=1)] = 0.1,
         test_share: Annotated[float, Field(gt=0, lt=1)] = 0.1,
         workers: Annotated[int, Field(ge=0)] = 2,
-        prepare_workers: Annotated[int, Field(gt=0)] | None = None,
+        prepare_workers: Annotated[int, Field(ge=0)] | None = None,
         verify: Verify = "changed",
     ) -> None:
         if not path:
@@ -114,17 +114,14 @@ class OwnVideosSource(RecordedSource):
         for key, wish in self._wished.items():
             there = manifest.settings[key]
             if key not in SPLITS and there != wish:  # how many there are is known: all are used
-                raise UserError(
-                    f"{path} was made with {key} = {there}, and data.{key} = {wish}: set data.{key}={there}."
-                )
+                raise UserError(f"{path} was made with {key} = {there} and not {wish}: set data.{key}={there}.")
         return manifest
 
     @cached_property
     def _found(self) -> list[Scanned]:
         """All videos."""
-        sources = find(self.path)
-        place = hashlib.sha256("\n".join(str(path.absolute()) for path in sources).encode()).hexdigest()[:16]
-        return scan(sources, self.root / f".own_videos_{place}.json")
+        place = hashlib.sha256(str(Path(self.path).expanduser().absolute()).encode()).hexdigest()[:16]
+        return scan(find(self.path), self.root / f".own_videos_{place}.json")
 
     @cached_property
     def _settings(self) -> Settings:
