@@ -15,8 +15,8 @@ from apex_lab.base.errors import UserError
 from apex_lab.config.schema import components, conf_dir
 from apex_lab.data import P2DSource, training_loader, whole_loader
 from apex_lab.data import p2d_source as code
-from sims.p2d.manifest import fingerprint
 from sims.p2d.settings import Settings
+from sims.p2d.store import fingerprint
 from tests.fakes.p2d_tools import FAKE
 
 SIZES = {"train": 5, "val": 3, "test": 2, "frames": 3, "image_size": 16, "workers": 0}

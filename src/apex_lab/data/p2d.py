@@ -24,10 +24,10 @@ from torch import Tensor
 from apex_lab.base.errors import UserError
 from apex_lab.data.video_set import MEDIAN_SAMPLE, Clip, VideoSet
 from apex_lab.metrics.objects import ObjectMetadata, p2d_metadata
+from recordings import array_path
 from sims.errors import SimError
 from sims.p2d.export import video_name as p2d_video_name
-from sims.p2d.store import FIELDS, SPLITS, array_path
-from sims.p2d.verify import check
+from sims.p2d.store import FIELDS, SPLITS, check
 
 
 class P2D(VideoSet):
@@ -109,7 +109,7 @@ class P2D(VideoSet):
             if name not in ("rgb", "segmentation"):
                 part = self._array(name)[position]
                 found[name] = np.array(part[self.clip] if "T" in field.dims else part)
-        found["names"] = [self.manifest.classes[number] for number in found["classes"] if number >= 0]
+        found["names"] = [self.manifest.facts["classes"][number] for number in found["classes"] if number >= 0]
         return found
 
     @property

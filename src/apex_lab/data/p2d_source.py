@@ -11,12 +11,12 @@ from pydantic import Field, ValidationError
 from apex_lab.base.errors import UserError
 from apex_lab.data.p2d import P2D
 from apex_lab.data.source import VideoSource
+from recordings import MANIFEST, is_verified, verify
 from sims.errors import SimError
 from sims.p2d.generate import generate
-from sims.p2d.manifest import MANIFEST, Manifest, fingerprint
 from sims.p2d.settings import Settings
 from sims.p2d.settings_text import command_words, sentence
-from sims.p2d.verify import check, is_verified, verify
+from sims.p2d.store import Manifest, check, fingerprint
 
 
 class P2DSource(VideoSource):
