@@ -17,9 +17,9 @@ from apex_lab.data.sketchy.split import SPLITS
 from apex_lab.data.sketchy.views import WINDOWS
 
 ABOUT = """\
-Prepares the Sketchy data set (Cabi et al. 2019) for `python -m apex_lab.train data=sketchy`: real videos of a robot arm,
-without labels. It reads episodes or archives of them, checks every checksum and every image, and cuts the images of
-GENESIS-V2: two front cameras, seven windows each. Episodes that are cut off or damaged are named and left out.
+Prepares the Sketchy data set (Cabi et al. 2019) for `python -m apex_lab.train data=sketchy`: real videos of a robot
+arm, without labels. It reads episodes or archives of them, checks every checksum and every image, and cuts the images
+of GENESIS-V2: two front cameras, seven windows each. Episodes that are cut off or damaged are named and left out.
 The same command resumes what was interrupted."""
 
 DOWNLOAD = f"""\
@@ -45,8 +45,8 @@ How to get the data
 
 What it needs and makes below --root
   {EXTRACTED}/          episodes out of archives, as large as these; can be deleted afterwards
-  sketchy_NAME_SIZEpx/       the recording: at 128 pixels 140 MB per episode of 201 timesteps with all windows, 56 GB for
-                             400 episodes; with --windows full 20 MB and 8 GB
+  sketchy_NAME_SIZEpx/       the recording: at 128 pixels 140 MB per episode of 201 timesteps with all windows, 56 GB
+                             for 400 episodes; with --windows full 20 MB and 8 GB
 
 Then
   python -m apex_lab.train data=sketchy data.name=NAME scale=paper

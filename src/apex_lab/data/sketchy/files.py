@@ -99,8 +99,8 @@ def _missing_parts(archives: Sequence[Path]) -> list[str]:
         missing = [f"{number:05d}" for number in range(count) if number not in numbers]
         if missing:
             sentences.append(
-                f"{subset}: {len(missing)} of {count} archives are missing ({_few(missing)}); the split by names will be "
-                "another one when they are there."
+                f"{subset}: {len(missing)} of {count} archives are missing ({_few(missing)}); with them the split by "
+                "names will be another one."
             )
     return sentences
 

@@ -55,10 +55,11 @@ def prepare(request: Request) -> Manifest[dict[str, Any]]:
         UserError: there is no sound episode, the recording is there with other episodes or settings, or the disk is
             full; what is finished is kept.
     """
-    episodes, wanted = _planned(request)
+    episodes, checks, wanted = _planned(request)
     _refuse_other(request, wanted)
+    maker = Timesteps(wanted.settings, episodes, checks.problems)
     try:
-        return record(request.recording, wanted, Timesteps(wanted.settings, episodes), workers=request.workers)
+        return record(request.recording, wanted, maker, workers=request.workers)
     except RecordingError as error:
         raise UserError(str(error)) from error
 
@@ -74,7 +75,7 @@ def repair_recording(request: Request) -> list[str]:
     except RecordingError as error:
         if not (request.recording / KIND.journal).is_file():
             raise UserError(str(error)) from error
-    episodes, _ = _planned(request)
+    episodes, _, _ = _planned(request)
 
     def maker(there: Plan[dict[str, Any]], facts: Mapping[str, Any]) -> Timesteps:
         missing = [
@@ -90,8 +91,8 @@ def repair_recording(request: Request) -> list[str]:
         raise UserError(str(error)) from error
 
 
-def _planned(request: Request) -> tuple[dict[str, Path], Plan[dict[str, Any]]]:
-    """The files of all episodes, and what their recording holds."""
+def _planned(request: Request) -> tuple[dict[str, Path], Checks, Plan[dict[str, Any]]]:
+    """The files of all episodes, what they are worth, and what their recording holds."""
     found = find(request.folder)
     root = make_folder(request.root.absolute())
     with _locked(root / ".sketchy.lock"):
@@ -106,7 +107,7 @@ def _planned(request: Request) -> tuple[dict[str, Path], Plan[dict[str, Any]]]:
         for split, names in split_by_name(episodes).items()
     }
     _say_empty(parts)
-    return episodes, plan(parts, request.image_size, request.windows)
+    return episodes, checks, plan(parts, request.image_size, request.windows)
 
 
 def _locked(path: Path) -> FileLock:
@@ -141,8 +142,8 @@ def _say_empty(parts: Mapping[str, Sequence[Episode]]) -> None:
     empty = [split for split in SPLITS if not parts[split]]
     if empty:
         console.warn(
-            f"No episode for {' and '.join(empty)}: the first tenth of all episodes, by name, is for val, the next tenth "
-            "for test, so that takes ten episodes or more."
+            f"No episode for {' and '.join(empty)}: the first tenth of all episodes, by name, is for val, the next "
+            "tenth for test, so that takes ten episodes or more."
         )
 
 

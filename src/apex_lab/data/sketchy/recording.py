@@ -32,7 +32,7 @@ KIND: Kind[dict[str, Any]] = Kind(
     items="timesteps",
     about=(
         "Robot manipulation videos of Cabi et al. (2019), prepared as for GENESIS-V2: windows of the two front cameras, "
-        "10 images per second, without labels. The settings in manifest.json list the episodes of each split with their "
+        "10 images per second, no labels. The settings in manifest.json list the episodes of each split with their "
         "numbers of timesteps, in the order in which the arrays hold them."
     ),
 )
@@ -83,9 +83,13 @@ class Timesteps(Maker):
     Args:
         settings: of the plan.
         files: episode's name -> file.
+        skipped: episode's name -> why it is left out.
     """
 
-    def __init__(self, settings: Mapping[str, Any], files: Mapping[str, Path]) -> None:
+    def __init__(
+        self, settings: Mapping[str, Any], files: Mapping[str, Path], skipped: Mapping[str, str] | None = None
+    ) -> None:
+        self.skipped = dict(skipped or {})
         self.image_size = int(settings["image_size"])
         self.views: list[View] = all_views(settings["windows"])
         self.episodes = episodes_of(settings)
@@ -98,7 +102,11 @@ class Timesteps(Maker):
         """The decoder and the filter that determine pixels."""
         turbo = features.version_feature("libjpeg_turbo")
         jpeg = f"turbo {turbo}" if turbo else str(features.version_codec("jpg"))
-        return {"versions": {"pillow": PIL.__version__, "libjpeg": jpeg}, "timesteps_per_second": 10}
+        return {
+            "versions": {"pillow": PIL.__version__, "libjpeg": jpeg},
+            "timesteps_per_second": 10,
+            "skipped": self.skipped,
+        }
 
     def make(self, split: str, index: int) -> Item:
         """Images (H, W, 3) by view."""

@@ -20,7 +20,9 @@ Window = Literal["full", "c0", "c1", "c2", "c3", "c4", "c5"]
 
 
 class SketchySource(VideoSource):
-    """Sketchy with the given settings. Preparing it takes long and needs files of the user: a command of its own does it.
+    """Sketchy with the given settings.
+
+    Preparing it takes long and needs files of the user: `python -m apex_lab.data.sketchy` does that.
 
     Args:
         root: folder of all data sets.

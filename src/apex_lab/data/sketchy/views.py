@@ -1,7 +1,7 @@
 """The images that GENESIS-V2 cuts from the two front cameras: two cameras, seven square windows each.
 
-A window of the 600 x 960 image is cut out, then resized by Pillow's bilinear filter, which averages over all pixels that
-fall into one when it shrinks. PyTorch's `interpolate` without `antialias=True` is another filter.
+A window of the 600 x 960 image is cut out, then resized by Pillow's bilinear filter, which averages over all pixels
+that fall into one when it shrinks. PyTorch's `interpolate` without `antialias=True` is another filter.
 """
 
 from __future__ import annotations
