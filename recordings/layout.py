@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,7 +74,7 @@ class Layout:
 
     def item_bytes(self, name: str) -> int:
         """Bytes of one item in array `name`."""
-        return int(np.prod(self.shape(name), dtype=np.int64)) * np.dtype(self.fields[name].dtype).itemsize
+        return math.prod(self.shape(name)) * np.dtype(self.fields[name].dtype).itemsize
 
     def array_bytes(self, split: str, name: str) -> int:
         """Size of an array's file."""

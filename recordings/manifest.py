@@ -110,7 +110,7 @@ def write_manifest(root: Path, manifest: Manifest[S]) -> None:
         "content": manifest.content,
         "settings": plan.kind.dump(plan.settings),
         **manifest.facts,
-        "arrays": described(plan.layout),
+        "arrays": described(plan.layout, meanings=False),
         **stored,
         "splits": {split: _split(manifest, split, count) for split, count in plan.layout.counts.items()},
     }

@@ -134,7 +134,7 @@ class Plan(Generic[S]):
         settings on machines that cannot make them too.
         """
         wish = {"format": FORMAT_VERSION, **self.kind.identity(), "settings": self.kind.dump(self.settings)}
-        return digest({**wish, **stored_layout(self)})[:16]
+        return digest({**wish, **stored_layout(self, meanings=False)})[:16]
 
     def difference(self, other: Plan[S]) -> str | None:
         """The first thing in which this plan (there) differs from another (here), in words; None for equal ones."""
@@ -147,24 +147,33 @@ class Plan(Generic[S]):
             before, now = self.layout.counts.get(split, 0), other.layout.counts.get(split, 0)
             if before != now:
                 return f"{split} has {before} {self.kind.items} there and {now} here"
-        return None if stored_layout(self) == stored_layout(other) else "its arrays have other types or shapes"
+        same = stored_layout(self, meanings=False) == stored_layout(other, meanings=False)
+        return None if same else "its arrays have other types or shapes"
 
 
-def stored_layout(plan: Plan[S]) -> dict[str, Any]:
-    """The layout as a manifest and a fingerprint hold it; empty where the settings determine it."""
+def stored_layout(plan: Plan[S], *, meanings: bool = True) -> dict[str, Any]:
+    """The layout as a manifest and, without meanings, a fingerprint hold it; empty where the settings determine it."""
     if not plan.kind.describes_itself:
         return {}
-    return {"sizes": dict(plan.layout.sizes), "arrays": described(plan.layout), "counts": dict(plan.layout.counts)}
+    layout = plan.layout
+    return {
+        "sizes": dict(layout.sizes),
+        "arrays": described(layout, meanings=meanings),
+        "counts": dict(layout.counts),
+    }
 
 
-def described(layout: Layout) -> dict[str, Any]:
-    """Type and shape of every array as JSON data; "N" is the number of items."""
-    return {name: {"dtype": f.dtype, "dims": ["N", *f.dims]} for name, f in layout.fields.items()}
+def described(layout: Layout, *, meanings: bool) -> dict[str, Any]:
+    """Type, shape and, if asked for, meaning of every array as JSON data; "N" is the number of items."""
+    return {
+        name: {"dtype": f.dtype, "dims": ["N", *f.dims], **({"meaning": f.meaning} if meanings else {})}
+        for name, f in layout.fields.items()
+    }
 
 
 def layout_from(data: Mapping[str, Any]) -> Layout:
     """The inverse of `stored_layout`; `ValueError`, `KeyError`, `TypeError` for anything else."""
-    fields = {name: Field(f["dtype"], tuple(f["dims"][1:])) for name, f in data["arrays"].items()}
+    fields = {name: Field(f["dtype"], tuple(f["dims"][1:]), f["meaning"]) for name, f in data["arrays"].items()}
     layout = Layout(fields, data["counts"], data["sizes"])
     numbers = [*layout.counts.values(), *(size for name in fields for size in layout.shape(name))]
     if not all(isinstance(number, int) and number >= 0 for number in numbers):
