@@ -167,25 +167,17 @@ def test_a_full_disk_is_told_and_nothing_is_lost(tmp_path: Path, monkeypatch: py
 
 
 def test_what_a_folder_holds(tmp_path: Path) -> None:
-    for name in (
-        "b/" + episode_name(2),
-        episode_name(1),
-        "c/" + episode_name(2),
-        ".hidden/" + episode_name(5),
-        "notes",
-    ):
+    one, two = episode_name(1), episode_name(2)
+    for name in (f"b/{two}", one, f"c/{two}", f".hidden/{episode_name(5)}", "notes"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     for number in (0, 3):
         (tmp_path / f"rgb30__all-{number:05d}-of-00005.tar.bz2").write_bytes(b"")
     found = find(tmp_path)
-    assert found.episodes == {
-        episode_name(1): tmp_path / episode_name(1),
-        episode_name(2): tmp_path / "b" / episode_name(2),
-    }
+    assert found.episodes == {one: tmp_path / one, two: tmp_path / "b" / two}
     assert len(found.archives) == 2
     assert "twice" in found.remarks[0]
-    assert str(tmp_path / "c" / episode_name(2)) in found.remarks[0]
+    assert str(tmp_path / "c" / two) in found.remarks[0]
     assert found.remarks[1].startswith("rgb30__all: 3 of 5 archives are missing (00001, 00002, 00004)")
 
 

@@ -31,8 +31,8 @@ KIND: Kind[dict[str, Any]] = Kind(
     item="timestep",
     items="timesteps",
     about=(
-        "Robot manipulation videos of Cabi et al. (2019), prepared as for GENESIS-V2: windows of the two front cameras, "
-        "10 images per second, no labels. The settings in manifest.json list the episodes of each split with their "
+        "Videos of a robot arm by Cabi et al. (2019), prepared as for GENESIS-V2: windows of the two front cameras, 10 "
+        "images per second, without labels. The settings in manifest.json list the episodes of each split with their "
         "numbers of timesteps, in the order in which the arrays hold them."
     ),
 )
@@ -104,7 +104,6 @@ class Timesteps(Maker):
         jpeg = f"turbo {turbo}" if turbo else str(features.version_codec("jpg"))
         return {
             "versions": {"pillow": PIL.__version__, "libjpeg": jpeg},
-            "timesteps_per_second": 10,
             "skipped": self.skipped,
         }
 

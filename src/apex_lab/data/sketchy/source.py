@@ -10,11 +10,12 @@ from pydantic import Field
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
+from apex_lab.data.recorded import Verify, refuse_damage, told
 from apex_lab.data.sketchy.recording import COMMAND, KIND, recording_folder
 from apex_lab.data.sketchy.split import SPLITS
 from apex_lab.data.sketchy.video_set import Sketchy
 from apex_lab.data.source import VideoSource
-from recordings import MANIFEST, Manifest, RecordingError, check, is_verified, verify
+from recordings import MANIFEST, Manifest, check
 
 Window = Literal["full", "c0", "c1", "c2", "c3", "c4", "c5"]
 
@@ -49,7 +50,7 @@ class SketchySource(VideoSource):
         val: Annotated[int, Field(ge=0)] | None = None,
         test: Annotated[int, Field(ge=0)] | None = None,
         workers: Annotated[int, Field(ge=0)] = 2,
-        verify: Literal["changed", "always", "never"] = "changed",
+        verify: Verify = "changed",
     ) -> None:
         self.folder = recording_folder(Path(root).expanduser().absolute(), name, image_size)
         self.name, self.image_size, self.frames, self.stride = name, image_size, frames, stride
@@ -64,18 +65,8 @@ class SketchySource(VideoSource):
         Raises:
             UserError: it is missing, unfinished or damaged; with the command that helps.
         """
-        try:
-            manifest = self._manifest()
-            if self.verify == "always" or (self.verify == "changed" and not is_verified(self.folder, manifest)):
-                damage = verify(self.folder, manifest)
-                if damage:
-                    lines = damage.lines()
-                    more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
-                    raise UserError(
-                        f"{self.folder} is damaged ({lines[0]}{more}): repair it with {self._command('--repair')}"
-                    )
-        except RecordingError as error:
-            raise UserError(str(error)) from error
+        with told():
+            refuse_damage(self.folder, self._manifest(), self.verify, self._command("--repair"))
 
     def _manifest(self) -> Manifest[dict[str, Any]]:
         if not (self.folder / MANIFEST).exists():
@@ -84,7 +75,8 @@ class SketchySource(VideoSource):
                 f"{self.folder} {begun}: prepare it with {self._command()}, where FOLDER holds the episodes; "
                 f"{COMMAND} --help says how to get them."
             )
-        return check(self.folder, KIND)
+        with told():
+            return check(self.folder, KIND)
 
     def _command(self, *more: str) -> str:
         words = [COMMAND, "FOLDER", "--root", str(self.folder.parent), "--name", self.name]

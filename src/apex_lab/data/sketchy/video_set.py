@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from apex_lab.base.errors import UserError
+from apex_lab.data.recorded import told
 from apex_lab.data.sketchy.recording import KIND, episodes_of
 from apex_lab.data.sketchy.split import SPLITS
 from apex_lab.data.sketchy.views import all_views
 from apex_lab.data.video_set import Clip, VideoSet
-from recordings import Reader, RecordingError
+from recordings import Reader
 
 
 class Sketchy(VideoSet):
@@ -51,10 +52,8 @@ class Sketchy(VideoSet):
         windows: Sequence[str] | None = None,
         episodes: int | None = None,
     ) -> None:
-        try:
+        with told():
             self._reader = Reader(folder, KIND, split)
-        except RecordingError as error:
-            raise UserError(str(error)) from error
         settings = self._reader.manifest.settings
         prepared = settings["windows"]
         for window in windows or ():
