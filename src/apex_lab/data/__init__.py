@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from apex_lab.data.clips import ClipSampler
     from apex_lab.data.loaders import training_loader, whole_loader
+    from apex_lab.data.own_videos.source import OwnVideosSource
     from apex_lab.data.p2d import P2D
     from apex_lab.data.p2d_source import P2DSource
+    from apex_lab.data.recorded import RecordedSet, RecordedSource
     from apex_lab.data.sketchy.source import SketchySource
     from apex_lab.data.sketchy.video_set import Sketchy
     from apex_lab.data.source import VideoSource
@@ -22,8 +24,10 @@ if TYPE_CHECKING:
 _MODULES = {
     "clips": ["ClipSampler"],
     "loaders": ["training_loader", "whole_loader"],
+    "own_videos.source": ["OwnVideosSource"],
     "p2d": ["P2D"],
     "p2d_source": ["P2DSource"],
+    "recorded": ["RecordedSet", "RecordedSource"],
     "sketchy.source": ["SketchySource"],
     "sketchy.video_set": ["Sketchy"],
     "source": ["VideoSource"],
@@ -36,7 +40,10 @@ __all__ = [
     "Clip",
     "ClipSampler",
     "Item",
+    "OwnVideosSource",
     "P2DSource",
+    "RecordedSet",
+    "RecordedSource",
     "Sketchy",
     "SketchySource",
     "Sprites",

@@ -51,6 +51,7 @@ def grey(video: torch.Tensor) -> list[int]:
 def test_clips_are_of_one_view_of_one_episode(root: Path) -> None:
     for split, videos in opened(root).items():
         assert not videos.labelled
+        assert not SketchySource.labelled
         assert videos.image_size == (32, 32)
         for index in range(len(videos)):
             item, about = videos[index], videos.meta(index)
@@ -190,7 +191,6 @@ def test_recipes_at_the_papers_scale(model: str) -> None:
     assert (clips["frames"]["values"] if isinstance(clips["frames"], dict) else clips["frames"]) == frames
     assert config["trainer"]["max_steps"] == steps
     assert config["model"].get("slots") == slots
-    assert config["trainer"]["monitor"] == "val/loss"
     if model == "scalor":
         assert set(config["loss"].values()) == {1 / data["frames"]}
     # nothing else differs from P2D
@@ -209,5 +209,7 @@ def test_training_on_generated_episodes(root: Path, tmp_path: Path, model: str, 
     assert "unlabelled, so there are no scores" in ended.out
     curves = next(tmp_path.rglob("curves.csv")).read_text().splitlines()
     assert "val/loss" in curves[0]
+    assert "val/objects_present" in curves[0]
+    assert len(list(tmp_path.rglob("best.ckpt"))) == 1
     assert "ari" not in curves[0]
     assert list(tmp_path.rglob("*.png"))

@@ -32,7 +32,7 @@ class Request:
         name: of the recording.
         image_size: height and width of its images in pixels.
         windows: names out of `views.WINDOWS`.
-        workers: processes and threads; None: one per core.
+        workers: processes and threads; None: one per core; 1: this process alone makes the recording.
     """
 
     folder: Path
@@ -41,6 +41,11 @@ class Request:
     image_size: int
     windows: tuple[str, ...]
     workers: int | None = None
+
+    @property
+    def processes(self) -> int | None:
+        """Processes besides this one that make the recording; None: one per core."""
+        return 0 if self.workers == 1 else self.workers
 
     @property
     def recording(self) -> Path:
@@ -59,7 +64,7 @@ def prepare(request: Request) -> Manifest[dict[str, Any]]:
     _refuse_other(request, wanted)
     maker = Timesteps(wanted.settings, episodes, checks.problems)
     try:
-        return record(request.recording, wanted, maker, workers=request.workers)
+        return record(request.recording, wanted, maker, workers=request.processes)
     except RecordingError as error:
         raise UserError(str(error)) from error
 
@@ -86,7 +91,7 @@ def repair_recording(request: Request) -> list[str]:
         return Timesteps(there.settings, episodes)
 
     try:
-        return repair(request.recording, KIND, maker, workers=request.workers).lines()
+        return repair(request.recording, KIND, maker, workers=request.processes).lines()
     except RecordingError as error:
         raise UserError(str(error)) from error
 

@@ -121,13 +121,14 @@ class Timesteps(Maker):
 
 
 def _images(file: Path, timesteps: int, timestep: int) -> dict[str, Any]:
-    records = _records(file)
+    status = file.stat()
+    records = _records(file, status.st_size, status.st_mtime_ns)
     if len(records) != timesteps:
         raise DamagedFileError(f"{len(records)} timesteps, not {timesteps}")
     return front_images(records, timestep)
 
 
 @lru_cache(maxsize=1)
-def _records(file: Path) -> Records:
-    """The episode that is being read; timesteps come in order, so one at a time is open."""
+def _records(file: Path, size: int, time: int) -> Records:
+    """The episode that is being read, at its size and time; timesteps come in order, so one at a time is open."""
     return Records(file)

@@ -38,6 +38,8 @@ class SketchySource(VideoSource):
             done, "always", or "never". Sizes and headers are checked in any case.
     """
 
+    labelled = False
+
     def __init__(
         self,
         root: str,
