@@ -82,7 +82,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
 
 
 def chosen(runtime: Any) -> dict[str, str]:
-    """The words chosen on the command line or by default; Hydra's own groups, and a recipe without a file, left out.
+    """The words chosen on the command line or by default; Hydra's own groups, and optional files not there, left out.
 
     Args:
         runtime: the `hydra.runtime` part of a composed configuration.
@@ -94,9 +94,9 @@ def chosen(runtime: Any) -> dict[str, str]:
         if elsewhere:  # no check of a choice would see it
             raise UserError(f"{key}={found[key]}: a choice of {group} has its own place: leave out @{package}.")
     folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
-    if not any((folder / "recipe" / f"{found.get('recipe')}.yaml").is_file() for folder in folders):
-        found.pop("recipe", None)
-    return found
+    return {
+        group: word for group, word in found.items() if any((at / group / f"{word}.yaml").is_file() for at in folders)
+    }
 
 
 def full_names(words: Sequence[str]) -> list[str]:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from apex_lab.data.p2d import P2D
     from apex_lab.data.p2d_source import P2DSource
     from apex_lab.data.recorded import RecordedSet, RecordedSource
+    from apex_lab.data.sketchy.source import SketchySource
+    from apex_lab.data.sketchy.video_set import Sketchy
     from apex_lab.data.source import VideoSource
     from apex_lab.data.sprites import Sprites, SpritesSource
     from apex_lab.data.video_set import Clip, Item, VideoSet
@@ -26,6 +28,8 @@ _MODULES = {
     "p2d": ["P2D"],
     "p2d_source": ["P2DSource"],
     "recorded": ["RecordedSet", "RecordedSource"],
+    "sketchy.source": ["SketchySource"],
+    "sketchy.video_set": ["Sketchy"],
     "source": ["VideoSource"],
     "sprites": ["Sprites", "SpritesSource"],
     "video_set": ["Clip", "Item", "VideoSet"],
@@ -40,6 +44,8 @@ __all__ = [
     "P2DSource",
     "RecordedSet",
     "RecordedSource",
+    "Sketchy",
+    "SketchySource",
     "Sprites",
     "SpritesSource",
     "VideoSet",

@@ -31,6 +31,26 @@ def told() -> Iterator[None]:
         raise UserError(str(error)) from error
 
 
+def refuse_damage(folder: Path, manifest: Manifest[Any], when: Verify, command: str) -> None:
+    """Compares all bytes with their checksums, if that is due.
+
+    Args:
+        folder: a finished recording.
+        manifest: its manifest.
+        when: as `RecordedSource.verify`.
+        command: repairs the folder.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    if when == "always" or (when == "changed" and not is_verified(folder, manifest)):
+        damage = verify(folder, manifest)
+        if damage:
+            lines = damage.lines()
+            more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
+            raise UserError(f"{folder} is damaged ({lines[0]}{more}): repair it with {command}")
+
+
 class RecordedSet(VideoSet):
     """One split of a finished recording with a field `rgb` (T, H, W, 3) and, if it is labelled, `segmentation`.
 
@@ -177,13 +197,7 @@ class RecordedSource(VideoSource):
                     )
                 self.make()
             manifest = check(folder, self.kind, self.plan())
-            if self.verify == "always" or (self.verify == "changed" and not is_verified(folder, manifest)):
-                damage = verify(folder, manifest)
-                if damage:
-                    lines = damage.lines()
-                    more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
-                    command = self.kind.repair_command.format(root=folder)
-                    raise UserError(f"{folder} is damaged ({lines[0]}{more}): repair it with {command}")
+            refuse_damage(folder, manifest, self.verify, self.kind.repair_command.format(root=folder))
 
     def open(self) -> None:
         """Opens the splits."""
