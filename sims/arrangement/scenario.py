@@ -123,7 +123,7 @@ def _placed(
             centres, yaws = centres[far], yaws[far]
         for centre, yaw in zip(centres, yaws.tolist(), strict=True):
             spot = _spot(shape, centre, yaw)
-            if all(_apart(spot, other) for other in spots):
+            if _fits(spot, spots):
                 spots.append(spot)
                 break
         else:
@@ -131,12 +131,17 @@ def _placed(
     return spots
 
 
-def _apart(one: _Spot, other: _Spot) -> bool:
-    """Whether both leave each other's rectangle, and at least one hand each, free."""
-    return (
-        separate(one.outline, other.outline, MARGIN_M)
-        and any(separate(hand, other.outline, HAND_MARGIN_M) for hand in one.hands)
-        and any(separate(hand, one.outline, HAND_MARGIN_M) for hand in other.hands)
+def _fits(spot: _Spot, spots: list[_Spot]) -> bool:
+    """Whether a further object leaves all rectangles apart, and the hand a free way down to each object."""
+    if not all(separate(spot.outline, other.outline, MARGIN_M) for other in spots):
+        return False
+    together = [*spots, spot]
+    return all(
+        any(
+            all(separate(hand, other.outline, HAND_MARGIN_M) for other in together if other is not one)
+            for hand in one.hands
+        )
+        for one in together
     )
 
 

@@ -32,16 +32,16 @@ class Settings(BaseModel):
     image_size: int = Field(default=128, ge=64, le=1024)
     renderer: Literal["tiny", "egl"] = "tiny"
     """'tiny' renders on the CPU, 'egl' on a GPU; their images differ."""
-    camera: Camera = Camera(eye=(0.48, -0.66, 0.84), target=(0.48, -0.01, 0.03), fov_deg=37.0)
+    camera: Camera = Camera(eye=(0.48, -0.66, 0.84), target=(0.48, -0.01, 0.03), fov_deg=31.0)
     depth: Literal["exact", "stereo"] = "exact"
     """'stereo' adds a stereo camera's noise and holes (`sensor.stereo`)."""
     objects: Names = ("potted_meat_can", "sugar_box", "tomato_soup_can", "foam_brick")
     """The first n are the group of the task with n objects."""
-    workspace_x: Span = (0.34, 0.62)
+    workspace_x: Span = (0.35, 0.61)
     """Centres of the objects in both scenes: metres in front of the robot's base."""
-    workspace_y: Span = (-0.22, 0.22)
+    workspace_y: Span = (-0.2, 0.2)
     """Metres to the left of the robot's base."""
-    edge_m: float = Field(default=0.07, ge=0.0, le=0.2)
+    edge_m: float = Field(default=0.06, ge=0.0, le=0.2)
     """Width of the edge around the workspace, where objects are put aside."""
     moved_m: float = Field(default=0.08, ge=0.0, le=0.3)
     """Minimum distance between an object's place in the current scene and its goal."""

@@ -12,6 +12,7 @@ from sims.assets import ObjectModel, object_models
 from sims.errors import SimError
 from sims.outlines import cover
 from sims.p2d.settings import Settings
+from sims.rectangles import rectangle, separate
 
 MARGIN_M = 0.015
 """Minimum distance between the footprints of two objects, and of an object and the gripper at its start."""
@@ -215,23 +216,3 @@ def _pushed(each: _Placed, start: np.ndarray, end: np.ndarray, hand: np.ndarray)
     if apart > 0 or shift < 0 or (outline @ along).max() < (hand @ along).min():
         return each.points
     return each.points + np.array([*(shift * along), 0.0])
-
-
-def rectangle(centre: np.ndarray, sides: tuple[float, float] | np.ndarray, yaw: float) -> np.ndarray:
-    """(4, 2) corners of a turned rectangle, in order."""
-    half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * np.asarray(sides) / 2
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    return half @ np.array([[cosine, sine], [-sine, cosine]]) + centre
-
-
-def separate(one: np.ndarray, other: np.ndarray, margin: float) -> bool:
-    """Whether two convex polygons (N, 2) lie at least `margin` apart along one of their edges' normals."""
-    for polygon in (one, other):
-        edges = np.roll(polygon, -1, axis=0) - polygon
-        normals = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        a, b = one @ normals.T, other @ normals.T
-        gap = np.maximum(b.min(axis=0) - a.max(axis=0), a.min(axis=0) - b.max(axis=0))
-        if gap.max() >= margin:
-            return True
-    return False

@@ -1,0 +1,169 @@
+"""Pick and place: planned as a whole before the arm moves, then carried out step by step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sims.arrangement.cell import OPEN_M, Blocked, Cell
+from sims.arrangement.cloud import Body
+from sims.arrangement.grasps import Grasp, grasps, releases
+from sims.arrangement.planner import HOME, Planner
+
+ABOVE_M = 0.1
+"""Height of the hand above its grasp before and after it."""
+OVER_M = 0.02
+"""A carried body passes this far above the others."""
+EMPTY_M = 0.008
+"""Fingers closer than this hold nothing."""
+SLOW = 0.35
+"""Share of the full speed at which the hand goes down to a body and puts it down."""
+ESCAPE_M, ESCAPE_STEP_M = 0.25, 0.03
+"""Height to which the hand goes straight up after a failure, and distance of the points on its way."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Joint paths (N, 7) of one pick and place, one after the other."""
+
+    grasp: Grasp
+    release: Grasp
+    approach: np.ndarray
+    descend: np.ndarray
+    lift: np.ndarray
+    carry: np.ndarray
+    lower: np.ndarray
+    retreat: np.ndarray
+    home: np.ndarray
+
+
+def plan(planner: Planner, body: Body, others: Sequence[Body], target: Body) -> Plan | None:
+    """The first pick and place of a body, from the retracted arm and back, that touches nothing else; None if there is
+    none."""
+    over = max((other.height for other in others), default=0.0) + OVER_M
+    for grasp in grasps(body):
+        for turn in (0.0, np.pi):
+            picked = _pick(planner, body, others, Grasp(grasp.point, grasp.yaw + turn, grasp.width))
+            if picked is None:
+                continue
+            for release in releases(body, picked[0], target):
+                placed = _place(planner, body, others, picked, release, over)
+                if placed is not None:
+                    return placed
+    return None
+
+
+def _pick(
+    planner: Planner, body: Body, others: Sequence[Body], grasp: Grasp
+) -> tuple[Grasp, np.ndarray, np.ndarray] | None:
+    """Grasp, way from home to above it, and down."""
+    above = grasp.point + np.array([0.0, 0.0, ABOVE_M])
+    start = planner.reach(above, grasp.yaw)
+    if start is None:
+        return None
+    planner.release()
+    planner.show(others)
+    descend = planner.straight(start, above, grasp.yaw, grasp.point, grasp.yaw, OPEN_M)
+    if descend is None:
+        return None
+    planner.show([*others, body])
+    approach = planner.swing(HOME, start, OPEN_M)
+    return None if approach is None else (grasp, approach, descend)
+
+
+def _place(
+    planner: Planner,
+    body: Body,
+    others: Sequence[Body],
+    picked: tuple[Grasp, np.ndarray, np.ndarray],
+    release: Grasp,
+    over: float,
+) -> Plan | None:
+    grasp, approach, descend = picked
+    up = np.array([0.0, 0.0, over])
+    end = planner.reach(release.point + np.array([0.0, 0.0, ABOVE_M]), release.yaw)
+    if end is None:
+        return None
+    planner.show(others)
+    planner.hold(body, grasp.point, grasp.yaw)
+    width = grasp.width / 2
+    lift = planner.straight(descend[-1], grasp.point, grasp.yaw, grasp.point + up, grasp.yaw, width)
+    if lift is None:
+        return None
+    carry = _carry(planner, lift[-1], grasp, release, up, width)
+    if carry is None:
+        return None
+    lower = planner.straight(carry[-1], release.point + up, release.yaw, release.point, release.yaw, width)
+    planner.release()
+    if lower is None:
+        return None
+    high = release.point + np.array([0.0, 0.0, ABOVE_M])
+    retreat = planner.straight(lower[-1], release.point, release.yaw, high, release.yaw, OPEN_M)
+    if retreat is None:
+        return None
+    home = planner.swing(retreat[-1], HOME, OPEN_M)
+    if home is None:
+        return None
+    return Plan(grasp, release, approach, descend, lift, carry, lower, retreat, home)
+
+
+def _carry(
+    planner: Planner, start: np.ndarray, grasp: Grasp, release: Grasp, up: np.ndarray, width: float
+) -> np.ndarray | None:
+    """From above the grasp to above the release: by joint angles if that is free, else in a straight line."""
+    end = planner.reach(release.point + up, release.yaw)
+    if end is not None:
+        path = planner.swing(start, end, width)
+        if path is not None:
+            return path
+    return planner.straight(start, grasp.point + up, grasp.yaw, release.point + up, release.yaw, width)
+
+
+def carry_out(cell: Cell, planner: Planner, plan: Plan, note: Callable[[str], None]) -> str | None:
+    """Carry out a plan; the arm is retracted afterwards, whatever happens.
+
+    Returns:
+        None if the body was let go at its place, else "no grip", "lost" (on the way) or "blocked".
+    """
+    try:
+        note("approach")
+        cell.grip(OPEN_M)
+        cell.follow(plan.approach)
+        note("grasp")
+        cell.follow(plan.descend, SLOW)
+        cell.grip(0.0)
+        note("lift")
+        cell.follow(plan.lift, SLOW)
+        if cell.width() < EMPTY_M:
+            escape(cell, planner)
+            return "no grip"
+        note("carry")
+        cell.follow(plan.carry)
+        note("place")
+        cell.follow(plan.lower, SLOW)
+        lost = cell.width() < EMPTY_M
+        cell.grip(OPEN_M)
+        note("retreat")
+        cell.follow(plan.retreat, SLOW)
+        cell.follow(plan.home)
+        return "lost" if lost else None
+    except Blocked:
+        note("blocked")
+        escape(cell, planner)
+        return "blocked"
+
+
+def escape(cell: Cell, planner: Planner) -> None:
+    """Let go, go up and home, whatever is in the way."""
+    cell.grip(OPEN_M)
+    path = [cell.joints()]
+    point, yaw = planner.where(path[0])
+    for height in np.arange(point[2] + ESCAPE_STEP_M, ESCAPE_M + ESCAPE_STEP_M, ESCAPE_STEP_M).tolist():
+        angles = planner.reach(np.array([*point[:2], height]), yaw, path[-1])
+        if angles is None:
+            break
+        path.append(angles)
+    cell.follow(np.array(path), SLOW, stubborn=True)
+    cell.follow(np.array([cell.joints(), HOME]), SLOW, stubborn=True)
