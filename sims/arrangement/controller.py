@@ -22,8 +22,9 @@ from sims.arrangement.settings import Settings
 from sims.arrangement.types import Ended
 from sims.rectangles import separate
 
-CLEAR_M = 0.008
-"""A target is free if no other body comes nearer to the object's rectangle there."""
+CLEAR_M = 0.012
+"""A target is free if no other body comes nearer to the object's rectangle there: the planner's distances and what a
+pixel can err."""
 APART_M = 0.03
 """Distance of a place at the edge from other bodies and from goals."""
 GRID_M = 0.03
@@ -36,6 +37,7 @@ VISITS = 3
 PLACES = 12
 """Places at the edge that are planned for one object, the nearest first."""
 SHOWN_PX = 1.0
+IDLE = 2
 
 Kind = Literal["home", "aside"]
 
@@ -214,9 +216,12 @@ class Controller:
         owner = dict(self.matches)
         bodies = [(owner.get(number), item.body) for number, item in enumerate(scene.items)]
         bodies += [(None, body) for body in scene.strangers]
-        blockers = [(goal, body) for goal, body in bodies if self._blocks(goal, body, picking)]
-        unsorted = [(goal, each.body) for goal, each in picking.items()]
-        for goal, body in blockers + unsorted:
+        ranks = [self._blocks(goal, body, picking) for goal, body in bodies]
+        for rank, goal, body in sorted(
+            ((rank, goal, body) for rank, (goal, body) in zip(ranks, bodies, strict=True)), key=lambda each: each[0]
+        ):
+            if rank == IDLE and (goal is None or self.states[goal].done):
+                continue
             if (self.moved_strangers if goal is None else self.states[goal].asides) >= ASIDES:
                 continue
             found = self._to_edge(self._picking(scene, body), list(targets.values()))
@@ -230,18 +235,22 @@ class Controller:
                 return Attempt(goal, "aside", body, place), path
         return None
 
-    def _blocks(self, goal: int | None, body: Body, picking: dict[int, Picking]) -> bool:
-        """Whether an open object's target would be free, or the way to it, if this body were not there."""
+    def _blocks(self, goal: int | None, body: Body, picking: dict[int, Picking]) -> int:
+        """How much a body is in the way of open objects: 0 if it alone stands on a target or keeps the hand away from
+        one, 1 if others do so too, `IDLE` if it does not."""
+        rank = IDLE
         for other, each in picking.items():
             if goal == other or not any(body is one for one in each.others) or self.states[other].visits >= VISITS:
                 continue
             target = self.goal.items[other].body
             rest = [one for one in each.others if one is not body]
-            if _is_free(each.body, target, rest):
-                taken = not _is_free(each.body, target, [body])
-                if taken or Picking(self.planner, each.body, rest).to(target) is not None:
-                    return True
-        return False
+            taken = not _is_free(each.body, target, [body])
+            if taken or not _room(each.body, [body]) or not _room(target, [body]):
+                rank = min(rank, 1)
+                alone = _is_free(each.body, target, rest)
+                if alone and (taken or Picking(self.planner, each.body, rest).to(target) is not None):
+                    return 0
+        return rank
 
     def _to_edge(self, picking: Picking, targets: list[Body]) -> tuple[Body, Plan] | None:
         """The nearest free place at the edge that can be reached, away from other bodies and open goals."""
