@@ -10,7 +10,8 @@ pytest.importorskip("pybullet")
 
 from sims.assets import object_models
 from sims.p2d.settings import Settings
-from sims.p2d.spec import GRIPPER_M, NoRoom, Spec, rectangle, sample, separate
+from sims.p2d.spec import GRIPPER_M, NoRoom, Spec, sample
+from sims.rectangles import rectangle, separate
 
 SETTINGS = Settings()
 
