@@ -13,16 +13,18 @@ import numpy as np
 
 from sims.arrangement.cell import Cell
 from sims.arrangement.cloud import Body
+from sims.arrangement.grasps import hands
 from sims.arrangement.matching import match
-from sims.arrangement.moves import Plan, carry_out, plan
+from sims.arrangement.moves import Picking, Plan, carry_out
 from sims.arrangement.planner import Planner
 from sims.arrangement.scene import Item, Scene, bounds
 from sims.arrangement.settings import Settings
 from sims.arrangement.types import Ended
 from sims.rectangles import separate
 
-CLEAR_M = 0.008
-"""A target is free if no other body comes nearer to the object's rectangle there."""
+CLEAR_M = 0.012
+"""A target is free if no other body comes nearer to the object's rectangle there: the planner's distances and what a
+pixel can err."""
 APART_M = 0.03
 """Distance of a place at the edge from other bodies and from goals."""
 GRID_M = 0.03
@@ -35,6 +37,7 @@ VISITS = 3
 PLACES = 12
 """Places at the edge that are planned for one object, the nearest first."""
 SHOWN_PX = 1.0
+IDLE = 2
 
 Kind = Literal["home", "aside"]
 
@@ -167,16 +170,25 @@ class Controller:
         retry = self._retry(scene)
         if retry is not None:
             return retry
-        for goal, item in self._open(scene):
-            target = self.goal.items[goal].body
-            others = scene.others(item.body)
-            if self.states[goal].visits < VISITS and _is_free(item.body, target, others):
-                path = plan(self.planner, item.body, others, target)
-                self.states[goal].no_path = path is None
+        picking = {goal: self._picking(scene, item.body) for goal, item in self._open(scene)}
+        for goal in sorted(picking, key=lambda goal: self._in_the_way(goal, picking)):
+            body, target, state = picking[goal].body, self.goal.items[goal].body, self.states[goal]
+            state.no_path = False
+            if state.visits < VISITS and _is_free(body, target, picking[goal].others):
+                path = picking[goal].to(target)
+                state.no_path = path is None
                 if path is not None:
-                    self.states[goal].visits += 1
-                    return Attempt(goal, "home", item.body, target), path
-        return self._aside(scene)
+                    state.visits += 1
+                    return Attempt(goal, "home", body, target), path
+        return self._aside(scene, picking)
+
+    def _picking(self, scene: Scene, body: Body) -> Picking:
+        return Picking(self.planner, body, scene.others(body))
+
+    def _in_the_way(self, goal: int, picking: dict[int, Picking]) -> int:
+        """How many open objects the hand could not reach any more if this one were at its goal."""
+        target = self.goal.items[goal].body
+        return sum(not _room(each.body, [target]) for other, each in picking.items() if other != goal)
 
     def _retry(self, scene: Scene) -> tuple[Attempt, Plan] | None:
         """The current sub-task again; closes it if it is done, was tried often enough or cannot be planned."""
@@ -185,10 +197,9 @@ class Controller:
             return None
         if attempt.goal is not None and attempt.failure is not None and attempt.attempts < self.settings.max_attempts:
             item = self._item(scene, attempt.goal)
-            if item is not None:
-                others = scene.others(item.body)
-                path = plan(self.planner, item.body, others, attempt.place)
-                if path is not None and _is_free(item.body, attempt.place, others):
+            if item is not None and _is_free(item.body, attempt.place, scene.others(item.body)):
+                path = self._picking(scene, item.body).to(attempt.place)
+                if path is not None:
                     attempt.body = item.body
                     return attempt, path
         self._close()
@@ -198,50 +209,64 @@ class Controller:
         """Goals that are not reached, with their objects."""
         return [(goal, scene.items[item]) for item, goal in self.matches if not self.states[goal].done]
 
-    def _aside(self, scene: Scene) -> tuple[Attempt, Plan] | None:
-        """Make room: an object that stands on the open goal of another, else any unsorted one, goes to the edge."""
-        still = self._open(scene)
-        targets = [(goal, self.goal.items[goal].body) for goal, _ in still]
-        matched = {item for item, _ in self.matches}
-        bodies: list[tuple[int | None, Body]] = [(goal, item.body) for goal, item in still]
-        bodies += [(None, item.body) for i, item in enumerate(scene.items) if i not in matched]
+    def _aside(self, scene: Scene, picking: dict[int, Picking]) -> tuple[Attempt, Plan] | None:
+        """Make room: a body that stands on the open goal of another or blocks the way, else any unsorted object, goes
+        to the edge."""
+        targets = {goal: self.goal.items[goal].body for goal in picking}
+        owner = dict(self.matches)
+        bodies = [(owner.get(number), item.body) for number, item in enumerate(scene.items)]
         bodies += [(None, body) for body in scene.strangers]
-
-        def blocks(goal: int | None, body: Body) -> bool:
-            return any(
-                goal != other and not separate(body.outline, target.outline, CLEAR_M) for other, target in targets
-            )
-
-        for goal, body in sorted(bodies, key=lambda each: not blocks(*each)):
-            if goal is None and (not blocks(None, body) or self.moved_strangers >= ASIDES):
+        ranks = [self._blocks(goal, body, picking) for goal, body in bodies]
+        for rank, goal, body in sorted(
+            ((rank, goal, body) for rank, (goal, body) in zip(ranks, bodies, strict=True)), key=lambda each: each[0]
+        ):
+            if rank == IDLE and (goal is None or self.states[goal].done):
                 continue
-            if goal is not None and self.states[goal].asides >= ASIDES:
+            if (self.moved_strangers if goal is None else self.states[goal].asides) >= ASIDES:
                 continue
-            found = self._to_edge(scene, body, [target for _, target in targets])
+            found = self._to_edge(self._picking(scene, body), list(targets.values()))
             if found is not None:
                 place, path = found
                 if goal is None:
                     self.moved_strangers += 1
                 else:
                     self.states[goal].asides += 1
+                    self.states[goal].done = False
                 return Attempt(goal, "aside", body, place), path
         return None
 
-    def _to_edge(self, scene: Scene, body: Body, targets: list[Body]) -> tuple[Body, Plan] | None:
+    def _blocks(self, goal: int | None, body: Body, picking: dict[int, Picking]) -> int:
+        """How much a body is in the way of open objects: 0 if it alone stands on a target or keeps the hand away from
+        one, 1 if others do so too, `IDLE` if it does not."""
+        rank = IDLE
+        for other, each in picking.items():
+            if goal == other or not any(body is one for one in each.others) or self.states[other].visits >= VISITS:
+                continue
+            target = self.goal.items[other].body
+            rest = [one for one in each.others if one is not body]
+            taken = not _is_free(each.body, target, [body])
+            if taken or not _room(each.body, [body]) or not _room(target, [body]):
+                rank = min(rank, 1)
+                alone = _is_free(each.body, target, rest)
+                if alone and (taken or Picking(self.planner, each.body, rest).to(target) is not None):
+                    return 0
+        return rank
+
+    def _to_edge(self, picking: Picking, targets: list[Body]) -> tuple[Body, Plan] | None:
         """The nearest free place at the edge that can be reached, away from other bodies and open goals."""
-        others = scene.others(body)
         low, high = bounds(self.settings)
         xs, ys = (np.arange(a, b + 1e-9, GRID_M) for a, b in zip(low, high, strict=True))
         grid = np.array([(x, y) for x in xs for y in ys])
         inner = ((grid > low + self.settings.edge_m / 2) & (grid < high - self.settings.edge_m / 2)).all(axis=1)
-        far = np.linalg.norm(grid - body.centre, axis=1)
+        far = np.linalg.norm(grid - picking.body.centre, axis=1)
+        around = [*picking.others, *targets]
         tried = 0
         for number in np.lexsort([far, inner]):
-            place = replace(body, centre=grid[number])
-            taken = any(not separate(place.outline, other.outline, APART_M) for other in [*others, *targets])
-            if taken or not self._visible(place):
+            place = replace(picking.body, centre=grid[number])
+            apart = all(separate(place.outline, other.outline, APART_M) for other in around)
+            if not apart or not _room(place, around) or not self._visible(place):
                 continue
-            path = plan(self.planner, body, others, place)
+            path = picking.to(place)
             if path is not None:
                 return place, path
             tried += 1
@@ -295,3 +320,9 @@ def _is_free(body: Body, target: Body, others: list[Body]) -> bool:
     """Whether an object would stand apart from all others at its target, turned as there or as it is."""
     there = replace(body, centre=target.centre, yaw=target.yaw)
     return all(separate(there.outline, other.outline, CLEAR_M) for other in others)
+
+
+def _room(body: Body, others: list[Body]) -> bool:
+    """Whether the hand can go down to a body without touching others."""
+    around = hands(body.centre, body.sides, body.yaw)
+    return any(all(separate(hand, other.outline, CLEAR_M) for other in others) for hand in around)

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from sims.arrangement.cloud import Body
+from sims.rectangles import rectangle
 
 WIDEST_M = 0.074
 """Widest body between the fingers, which open to 80 mm."""
 PAD_M = 0.012
 """Half the width of a finger along the body."""
-DEPTH_M, LOWEST_M = 0.033, 0.014
-"""The point between the fingertips lies this far below the body's top, but not lower than this above the table: the
-palm is 39 mm above it, the tips 7 mm below."""
+DEPTHS_M, LOWEST_M = (0.033, 0.018), 0.014
+"""The point between the fingertips lies this far below the body's top, the second where neighbours leave the hand no
+room, but not lower than this above the table: the palm is 39 mm above it, the tips 7 mm below."""
+HAND_M = (0.07, 0.225)
+"""Rectangle of the open hand seen from above: along and across the plane between the fingers."""
 ROUND = 1.15
 """Ratio of the sides up to which a body may be taken in any direction."""
 SQUARE = 1.3
@@ -38,21 +41,31 @@ class Grasp:
     width: float
 
 
+def turns_of(sides: tuple[float, float]) -> list[float]:
+    """Angles between a body's long side and the hand's yaw, the best first: all around for a round body."""
+    if sides[0] < ROUND * sides[1]:
+        return [number * np.pi / 6 for number in (0, 3, 1, 5, 2, 4)]
+    return [0.0, np.pi / 2]
+
+
+def hands(centre: np.ndarray, sides: tuple[float, float], yaw: float) -> list[np.ndarray]:
+    """Rectangles (4, 2) of the hand above a body that fits between its fingers."""
+    turns = [turn for turn in turns_of(sides) if turn == 0 or max(sides) <= WIDEST_M]
+    return [rectangle(centre, HAND_M, yaw + turn) for turn in turns]
+
+
 def grasps(body: Body) -> list[Grasp]:
     """Grasps that fit between the fingers, the best first: across the narrow side, else at right angles; all around a
     round body. Empty if the body is too wide."""
-    turns = [0.0, np.pi / 2]
-    if body.sides[0] < ROUND * body.sides[1]:
-        turns = [number * np.pi / 6 for number in (0, 3, 1, 5, 2, 4)]
-    found = []
-    for turn in turns:
-        grasp = _across(body, body.yaw + turn)
-        if grasp is not None:
-            found.append(grasp)
-    return found
+    return [
+        grasp
+        for depth in DEPTHS_M
+        for turn in turns_of(body.sides)
+        if (grasp := _across(body, body.yaw + turn, depth)) is not None
+    ]
 
 
-def _across(body: Body, yaw: float) -> Grasp | None:
+def _across(body: Body, yaw: float, depth: float) -> Grasp | None:
     """The grasp at the middle of the body, by the width of the slice that the fingers touch."""
     along, across = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
     flat = body.points[:, :2] - body.centre
@@ -65,9 +78,8 @@ def _across(body: Body, yaw: float) -> Grasp | None:
     width = high - low + body.pixel
     if width > WIDEST_M:
         return None
-    height = max(LOWEST_M, body.height - DEPTH_M)
     point = body.centre + middle * along + (low + high) / 2 * across
-    return Grasp(np.array([*point, height]), wrapped(yaw), width)
+    return Grasp(np.array([*point, max(LOWEST_M, body.height - depth)]), wrapped(yaw), width)
 
 
 def releases(body: Body, grasp: Grasp, target: Body) -> list[Grasp]:
@@ -75,12 +87,10 @@ def releases(body: Body, grasp: Grasp, target: Body) -> list[Grasp]:
 
     The body is turned so that its long side lies as the target's, either way round; as a last resort it is not turned.
     """
-    turns: list[float] = []
+    turns = [0.0, np.pi]
     if min(body.sides[0] / body.sides[1], target.sides[0] / target.sides[1]) >= SQUARE:
         turn = wrapped(target.yaw - body.yaw)
-        turns = [turn, wrapped(turn + np.pi)]
-    turns.append(0.0)
-    turns.append(np.pi)
+        turns = [turn, wrapped(turn + np.pi)] + (turns if abs(np.sin(turn)) > 1e-6 else [])
     return [_turned(body, grasp, target.centre, turn) for turn in turns]
 
 

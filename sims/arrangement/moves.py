@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from sims.arrangement.cell import OPEN_M, Blocked, Cell
 from sims.arrangement.cloud import Body
-from sims.arrangement.grasps import Grasp, grasps, releases
+from sims.arrangement.grasps import Grasp, grasps, releases, wrapped
 from sims.arrangement.planner import HOME, Planner
 
-ABOVE_M = 0.1
-"""Height of the hand above its grasp before and after it."""
+ABOVE = np.array([0.0, 0.0, 0.1])
+"""The hand is this far above its grasp before and after it, in metres."""
 OVER_M = 0.02
 """A carried body passes this far above the others."""
 EMPTY_M = 0.008
@@ -22,6 +22,13 @@ SLOW = 0.35
 """Share of the full speed at which the hand goes down to a body and puts it down."""
 ESCAPE_M, ESCAPE_STEP_M = 0.25, 0.03
 """Height to which the hand goes straight up after a failure, and distance of the points on its way."""
+
+
+@dataclass(frozen=True)
+class _Pick:
+    grasp: Grasp
+    approach: np.ndarray
+    descend: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -39,74 +46,73 @@ class Plan:
     home: np.ndarray
 
 
-def plan(planner: Planner, body: Body, others: Sequence[Body], target: Body) -> Plan | None:
-    """The first pick and place of a body, from the retracted arm and back, that touches nothing else; None if there is
-    none."""
-    over = max((other.height for other in others), default=0.0) + OVER_M
-    for grasp in grasps(body):
-        for turn in (0.0, np.pi):
-            picked = _pick(planner, body, others, Grasp(grasp.point, grasp.yaw + turn, grasp.width))
-            if picked is None:
-                continue
-            for release in releases(body, picked[0], target):
-                placed = _place(planner, body, others, picked, release, over)
+class Picking:
+    """All ways to pick up one body among others, found one by one and kept for several targets."""
+
+    def __init__(self, planner: Planner, body: Body, others: Sequence[Body]) -> None:
+        self.planner, self.body, self.others = planner, body, others
+        self._found: list[_Pick] = []
+        self._more = self._search()
+
+    def to(self, target: Body) -> Plan | None:
+        """The first pick and place, from the retracted arm and back, that touches nothing else; None: there is none."""
+        for pick in self._picks():
+            for release in releases(self.body, pick.grasp, target):
+                placed = self._place(pick, release)
                 if placed is not None:
                     return placed
-    return None
+        return None
 
+    def _picks(self) -> Iterator[_Pick]:
+        yield from self._found
+        for pick in self._more:
+            self._found.append(pick)
+            yield pick
 
-def _pick(
-    planner: Planner, body: Body, others: Sequence[Body], grasp: Grasp
-) -> tuple[Grasp, np.ndarray, np.ndarray] | None:
-    """Grasp, way from home to above it, and down."""
-    above = grasp.point + np.array([0.0, 0.0, ABOVE_M])
-    start = planner.reach(above, grasp.yaw)
-    if start is None:
-        return None
-    planner.release()
-    planner.show(others)
-    descend = planner.straight(start, above, grasp.yaw, grasp.point, grasp.yaw, OPEN_M)
-    if descend is None:
-        return None
-    planner.show([*others, body])
-    approach = planner.swing(HOME, start, OPEN_M)
-    return None if approach is None else (grasp, approach, descend)
+    def _search(self) -> Iterator[_Pick]:
+        for grasp in grasps(self.body):
+            for turn in (0.0, np.pi):
+                pick = self._pick(Grasp(grasp.point, wrapped(grasp.yaw + turn), grasp.width))
+                if pick is not None:
+                    yield pick
 
+    def _pick(self, grasp: Grasp) -> _Pick | None:
+        planner, above = self.planner, grasp.point + ABOVE
+        start = planner.reach(above, grasp.yaw)
+        if start is None:
+            return None
+        planner.release()
+        planner.show(self.others)
+        descend = planner.straight(start, above, grasp.yaw, grasp.point, grasp.yaw, OPEN_M)
+        if descend is None:
+            return None
+        planner.show([*self.others, self.body])
+        approach = planner.swing(HOME, start, OPEN_M)
+        return None if approach is None else _Pick(grasp, approach, descend)
 
-def _place(
-    planner: Planner,
-    body: Body,
-    others: Sequence[Body],
-    picked: tuple[Grasp, np.ndarray, np.ndarray],
-    release: Grasp,
-    over: float,
-) -> Plan | None:
-    grasp, approach, descend = picked
-    up = np.array([0.0, 0.0, over])
-    end = planner.reach(release.point + np.array([0.0, 0.0, ABOVE_M]), release.yaw)
-    if end is None:
-        return None
-    planner.show(others)
-    planner.hold(body, grasp.point, grasp.yaw)
-    width = grasp.width / 2
-    lift = planner.straight(descend[-1], grasp.point, grasp.yaw, grasp.point + up, grasp.yaw, width)
-    if lift is None:
-        return None
-    carry = _carry(planner, lift[-1], grasp, release, up, width)
-    if carry is None:
-        return None
-    lower = planner.straight(carry[-1], release.point + up, release.yaw, release.point, release.yaw, width)
-    planner.release()
-    if lower is None:
-        return None
-    high = release.point + np.array([0.0, 0.0, ABOVE_M])
-    retreat = planner.straight(lower[-1], release.point, release.yaw, high, release.yaw, OPEN_M)
-    if retreat is None:
-        return None
-    home = planner.swing(retreat[-1], HOME, OPEN_M)
-    if home is None:
-        return None
-    return Plan(grasp, release, approach, descend, lift, carry, lower, retreat, home)
+    def _place(self, pick: _Pick, release: Grasp) -> Plan | None:
+        """Lift, carry, lower, retreat and home; None if one of them is not free."""
+        planner, grasp, width = self.planner, pick.grasp, pick.grasp.width / 2
+        if planner.reach(release.point, release.yaw) is None:
+            return None
+        up = np.array([0.0, 0.0, max((other.height for other in self.others), default=0.0) + OVER_M])
+        planner.show(self.others)
+        planner.hold(self.body, grasp.point, grasp.yaw)
+        try:
+            lift = planner.straight(pick.descend[-1], grasp.point, grasp.yaw, grasp.point + up, grasp.yaw, width)
+            carry = None if lift is None else _carry(planner, lift[-1], grasp, release, up, width)
+            if lift is None or carry is None:
+                return None
+            lower = planner.straight(carry[-1], release.point + up, release.yaw, release.point, release.yaw, width)
+        finally:
+            planner.release()
+        if lower is None:
+            return None
+        retreat = planner.straight(lower[-1], release.point, release.yaw, release.point + ABOVE, release.yaw, OPEN_M)
+        home = None if retreat is None else planner.swing(retreat[-1], HOME, OPEN_M)
+        if retreat is None or home is None:
+            return None
+        return Plan(grasp, release, pick.approach, pick.descend, lift, carry, lower, retreat, home)
 
 
 def _carry(

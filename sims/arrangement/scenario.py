@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sims.arrangement.grasps import hands
 from sims.arrangement.settings import RESTS, Settings
 from sims.assets import ObjectModel, object_models
 from sims.errors import SimError
@@ -17,11 +18,7 @@ from sims.rectangles import rectangle, separate
 
 MARGIN_M = 0.03
 """Minimum distance between two objects' rectangles on the table."""
-HAND_M = (0.07, 0.225)
-"""Rectangle of the open hand seen from above: along and across the plane between the fingers."""
 HAND_MARGIN_M = 0.008
-ROUND = 1.15
-"""Ratio of the sides up to which an object may be grasped in any direction."""
 VISIBLE = 0.7
 """Minimum visible share of every object's outline."""
 CANDIDATES, RESTARTS = 40, 500
@@ -150,12 +147,11 @@ def _spot(shape: _Shape, centre: np.ndarray, yaw: float) -> _Spot:
     position = np.array([*centre, shape.lift_m])
     long, narrow = float(shape.sides.max()), float(shape.sides.min())
     along = yaw + (0.0 if shape.sides[0] >= shape.sides[1] else np.pi / 2)
-    turns = np.arange(0, np.pi, np.pi / 6) if long / narrow < ROUND else np.zeros(1)
     place, quaternion = (tuple(float(value) for value in row) for row in (position, turned.as_quat()))
     return _Spot(
         Placement(shape.model.name, place, quaternion),  # type: ignore[arg-type]
         rectangle(centre, shape.sides, yaw),
-        tuple(rectangle(centre, HAND_M, along + turn) for turn in turns.tolist()),
+        tuple(hands(centre, (long, narrow), along)),
         turned.apply(shape.model.vertices) + position,
     )
 
