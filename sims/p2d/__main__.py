@@ -6,13 +6,12 @@ import argparse
 import sys
 from pathlib import Path
 
+from recordings import MANIFEST, read_journal, verify
 from sims.errors import SimError
 from sims.p2d.generate import generate, repair
-from sims.p2d.manifest import MANIFEST, read_journal, read_manifest
 from sims.p2d.settings import Settings
 from sims.p2d.settings_text import SettingsError, settings_from
-from sims.p2d.store import SPLITS, total_bytes
-from sims.p2d.verify import verify
+from sims.p2d.store import KIND, SPLITS, read_manifest
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -39,8 +38,8 @@ def _make(options: argparse.Namespace) -> int:
     if not options.no_card and not (root / "card" / "README.md").exists():
         _card(argparse.Namespace(dir=root, out=None))
     made = ", ".join(f"{getattr(settings, split)} {split}" for split in SPLITS)
-    redrawn = sum(record.redraws for record in manifest.records.values())
-    print(f"{root}: {made} trajectories, {total_bytes(settings) / 1e9:.2f} GB, {redrawn} attempts redrawn")
+    redrawn = sum(record.notes["redraws"] for record in manifest.records.values())
+    print(f"{root}: {made} trajectories, {manifest.layout.total_bytes() / 1e9:.2f} GB, {redrawn} attempts redrawn")
     return 0
 
 
@@ -48,8 +47,8 @@ def _begun(root: Path) -> Settings | None:
     """Settings of a finished or unfinished folder, so that resuming it does not need them on the command line."""
     if (root / MANIFEST).exists():
         return read_manifest(root).settings
-    found = read_journal(root) if root.is_dir() else None
-    return found[0] if found else None
+    found = read_journal(root, KIND) if root.is_dir() else None
+    return found[0].settings if found else None
 
 
 def _verify(options: argparse.Namespace) -> int:

@@ -23,7 +23,7 @@ from apex_lab.metrics import (
     link_frames,
 )
 from apex_lab.metrics.ignored import likely_void
-from apex_lab.metrics.order import natural_key
+from apex_lab.base.order import natural_key
 
 VOID = 255
 

@@ -14,8 +14,8 @@ from sims.errors import SimError
 from sims.p2d import draw
 from sims.p2d.__main__ import main
 from sims.p2d.card import write_card
-from sims.p2d.manifest import read_manifest
 from sims.p2d.stats import Stats, statistics
+from sims.p2d.store import read_manifest
 from tests.fakes.p2d_tools import make, small
 
 

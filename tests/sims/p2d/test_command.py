@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from sims.p2d import __main__ as command
-from sims.p2d.manifest import read_manifest
 from sims.p2d.settings import Settings
 from sims.p2d.settings_text import SettingsError, command_words, settings_from
+from sims.p2d.store import read_manifest
 from tests.fakes.p2d_tools import FAKE, content, make, small, start, words
 
 

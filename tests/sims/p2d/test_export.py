@@ -16,7 +16,7 @@ from sims.errors import SimError
 from sims.p2d import export as module
 from sims.p2d.__main__ import main
 from sims.p2d.export import export
-from sims.p2d.manifest import read_manifest
+from sims.p2d.store import read_manifest
 from tests.fakes.p2d_tools import make, small
 
 
