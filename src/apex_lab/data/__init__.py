@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from apex_lab.data.arrangement import ArrangementClips, ArrangementSource
 from apex_lab.data.clips import ClipSampler
 from apex_lab.data.loaders import training_loader, whole_loader
 from apex_lab.data.p2d import P2D
@@ -12,6 +13,8 @@ from apex_lab.data.video_set import Clip, Item, VideoSet
 
 __all__ = [
     "P2D",
+    "ArrangementClips",
+    "ArrangementSource",
     "Clip",
     "ClipSampler",
     "Item",
