@@ -57,7 +57,8 @@ def drawn(frame: Frame, name: str) -> Image.Image:
     """
     current = {i: number for number, (i, _) in enumerate(frame.matches)}
     goal = {j: number for number, (_, j) in enumerate(frame.matches)}
-    height, width = cell_size(*frame.view.rgb.shape[:2], CELL)
+    rows, columns = frame.view.rgb.shape[:2]
+    height, width = cell_size(rows, columns, CELL)
     page, draw = sheet(_even(2 * MARGIN + 2 * width + GAP), _even(2 * MARGIN + 2 * _LINE + height))
     draw.text((MARGIN, MARGIN), f"scenario {name}", INK, font(14, bold=True))
     time = f"{frame.time_s:.1f} s"
