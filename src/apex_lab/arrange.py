@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.arrangement import benchmark
 from apex_lab.arrangement.benchmark import Benchmark
 from apex_lab.arrangement.perception import Perception, Trained
-from apex_lab.arrangement.worker import Setting, Task, digest_of
+from apex_lab.arrangement.task import Setting, Task, digest_of
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence, shown, validate
@@ -196,7 +196,8 @@ def _of_file(job: Arrangement, file: Path) -> Benchmark:
     run = run_folder(file)
     in_run = (run / "run.json").is_file()
     early = (content["training"] or {}).get("ended", False)
-    ended = early or content["step"] >= trained.config.trainer.max_steps
+    learns = config.build_model(trained.config).needs_training
+    ended = early or content["step"] >= trained.config.trainer.max_steps or not learns
     usual = (asked.tasks, asked.scenarios, asked.seed, job.world) == (TASKS, SCENARIOS, SEED, Settings())
     usual &= components.build(asked.perception, "perception") == Trained()
     words = [trained.choices["model"], *([file.stem] if not in_run or file.name != "last.ckpt" or not ended else [])]

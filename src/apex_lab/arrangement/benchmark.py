@@ -12,7 +12,7 @@ from filelock import FileLock, Timeout
 
 from apex_lab.arrangement.pool import Pool
 from apex_lab.arrangement.results import Outcome, Store, identity, summary, table, write
-from apex_lab.arrangement.worker import Failure, Setting, Task
+from apex_lab.arrangement.task import Failure, Setting, Task
 from apex_lab.base import console
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import make_folder

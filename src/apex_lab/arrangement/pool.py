@@ -11,7 +11,8 @@ from collections.abc import Generator, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from apex_lab.arrangement.worker import Answer, Failure, Serve, Setting, Task, serve
+from apex_lab.arrangement.task import Answer, Failure, Serve, Setting, Task
+from apex_lab.arrangement.worker import serve
 from apex_lab.base import interrupts
 
 TRIES = 3

@@ -13,7 +13,7 @@ from typing import Any
 
 import sims
 from apex_lab import inference, models, nn
-from apex_lab.arrangement.worker import Setting, Task
+from apex_lab.arrangement.task import Setting, Task
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, read_json, write_json, write_text
 from apex_lab.runs import provenance

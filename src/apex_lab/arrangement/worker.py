@@ -3,108 +3,41 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import os
 import signal
 import time
 import traceback
-from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from apex_lab.arrangement.film import filming
 from apex_lab.arrangement.perception import Perception
+from apex_lab.arrangement.task import Failure, Setting, Task, digest_of
 from apex_lab.base.errors import UserError
 from apex_lab.config import components
 from apex_lab.runs import checkpoints
 from sims.arrangement import episode, scenario
-from sims.arrangement.settings import Settings
 from sims.arrangement.types import Perceive
 from sims.errors import SimError
 
 
-@dataclass(frozen=True)
-class Task:
-    """One scenario: number of objects, index, and where its video goes (None: no video)."""
+def perceive_of(setting: Setting) -> Perceive:
+    """Builds perception.
 
-    objects: int
-    index: int
-    film: Path | None = None
-
-    @property
-    def name(self) -> str:
-        """As on the command line: "4/17"."""
-        return f"{self.objects}/{self.index}"
-
-
-@dataclass(frozen=True)
-class Setting:
-    """What all scenarios of a command share. It is sent to other processes, so it holds no model.
-
-    Attributes:
-        perception: node of a `Perception`.
-        checkpoint: file with the model's weights; None where none is needed.
-        digest: SHA-256 of that file.
-        trusted: as of `checkpoints.load`.
-        device: name of the device that models run on.
-        world: settings of the simulation.
-        seed: of the scenarios.
+    Raises:
+        UserError: the model cannot do this task, or the checkpoint has changed since the command was started.
     """
-
-    perception: Mapping[str, Any]
-    checkpoint: Path | None
-    digest: str | None
-    trusted: bool
-    device: str
-    world: Settings
-    seed: int
-
-    def perceive(self) -> Perceive:
-        """Builds perception.
-
-        Raises:
-            UserError: the model cannot do this task, or the checkpoint has changed since the command was started.
-        """
-        perception = components.build(self.perception, "perception")
-        assert isinstance(perception, Perception)
-        inference = None
-        if self.checkpoint is not None:
-            if digest_of(self.checkpoint) != self.digest:
-                raise UserError(f"{self.checkpoint} has changed meanwhile: run the same command again.")
-            inference = checkpoints.load(self.checkpoint, self.trusted)["inference"]
-        return perception.ready(inference, torch.device(self.device))
-
-
-@dataclass(frozen=True)
-class Failure:
-    """Why a scenario has no outcome.
-
-    Attributes:
-        reason: on one line.
-        details: a traceback.
-        final: every scenario would fail so.
-    """
-
-    reason: str
-    details: str = ""
-    final: bool = False
-
-
-Answer = dict[str, Any] | Failure
-"""An outcome as plain data (`sims.arrangement.types.Outcome`, and `seconds` of processor time), or a failure."""
-
-Serve = Callable[[Connection, Setting], None]
-
-
-def digest_of(file: Path) -> str:
-    """SHA-256 of a file, in hex."""
-    with open(file, "rb") as opened:
-        return hashlib.file_digest(opened, "sha256").hexdigest()
+    perception = components.build(setting.perception, "perception")
+    assert isinstance(perception, Perception)
+    inference = None
+    if setting.checkpoint is not None:
+        if digest_of(setting.checkpoint) != setting.digest:
+            raise UserError(f"{setting.checkpoint} has changed meanwhile: run the same command again.")
+        inference = checkpoints.load(setting.checkpoint, setting.trusted)["inference"]
+    return perception.ready(inference, torch.device(setting.device))
 
 
 def serve(connection: Connection, setting: Setting) -> None:
@@ -118,7 +51,7 @@ def serve(connection: Connection, setting: Setting) -> None:
         while True:
             task: Task = connection.recv()
             try:
-                perceive = perceive or setting.perceive()
+                perceive = perceive or perceive_of(setting)
                 connection.send(arranged(task, setting, perceive))
             except (UserError, SimError) as error:
                 connection.send(Failure(str(error), final=True))

@@ -80,7 +80,9 @@ class ArrangementSource(RecordedSource):
         fixed, further = {"seed": data_seed, **sizes}, dict(simulation or {})
         for key in further:
             if key in fixed:
-                raise UserError(f"simulation.{key} is not a key: set data.{'data_seed' if key == 'seed' else key} instead")
+                raise UserError(
+                    f"simulation.{key} is not a key: set data.{'data_seed' if key == 'seed' else key} instead"
+                )
         settings = validate(Settings, {**fixed, **further}, "simulation")
         assert isinstance(settings, Settings)
         self.settings = settings
