@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -12,7 +13,7 @@ from sims.assets import ObjectModel, object_models
 from sims.errors import SimError
 from sims.outlines import cover
 from sims.p2d.settings import Settings
-from sims.rectangles import rectangle, separate
+from sims.rectangles import Rectangles, rectangle, separate
 
 MARGIN_M = 0.015
 """Minimum distance between the footprints of two objects, and of an object and the gripper at its start."""
@@ -33,6 +34,10 @@ SEEN = 0.4
 OUTLINE_PX = 64
 DROP_M = 0.0005
 TRIES = 20
+CROWDED = 4
+"""From this many objects on, places are drawn `CANDIDATES` at once, the largest objects first: one by one, nearly all
+tries fail for lack of room. With fewer, the draws are those of `_place`, on which the bytes of data sets depend."""
+CANDIDATES, CROWDED_TRIES = 48, 150
 SAME_CLASSES = 5
 
 
@@ -98,8 +103,9 @@ def sample(settings: Settings, split: str, index: int, attempt: int = 0) -> Spec
     rng = generator(settings, split, index, attempt)
     if attempt >= SAME_CLASSES:
         classes = [int(number) for number in rng.choice(len(models), size=count, replace=False)]
-    for _ in range(TRIES):
-        objects = _place(settings, models, classes, rng)
+    place, tries = (_place, TRIES) if count < CROWDED else (_place_crowded, CROWDED_TRIES)
+    for _ in range(tries):
+        objects = place(settings, models, classes, rng)
         line = None if objects is None else _line(settings, objects, aimed, rng)
         if objects is not None and line is not None:
             start, end, yaw = line
@@ -150,12 +156,74 @@ def _some_hidden(settings: Settings, placed: list[_Placed]) -> bool:
     return False
 
 
+def _place_crowded(
+    settings: Settings, models: tuple[ObjectModel, ...], classes: list[int], rng: np.random.Generator
+) -> list[_Placed] | None:
+    """As `_place`, for many objects."""
+    low, high = np.transpose([settings.workspace_x, settings.workspace_y])
+    places: dict[int, tuple[int, np.ndarray, float]] = {}
+    taken = Rectangles(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+    for class_index in sorted(classes, key=lambda number: -max(rest.sides.prod() for rest in _rests(models[number]))):
+        rests = _rests(models[class_index])
+        chosen = rng.integers(len(rests), size=CANDIDATES)
+        candidates = Rectangles(
+            rng.uniform(low, high, size=(CANDIDATES, 2)),
+            np.stack([rest.sides for rest in rests])[chosen],
+            rng.uniform(-np.pi, np.pi, size=CANDIDATES),
+        )
+        for number in np.flatnonzero((candidates.gaps(taken) >= MARGIN_M).all(axis=1)):
+            rest, centre, yaw = rests[chosen[number]], candidates.centres[number], float(candidates.yaws[number])
+            if _in_picture(settings, rest.at(centre, yaw)):
+                places[class_index] = rest.number, centre, yaw
+                taken = taken.joined(candidates[number : number + 1])
+                break
+        else:
+            return None
+    placed = [_put_at(settings, models[class_index], class_index, *places[class_index]) for class_index in classes]
+    whole = [each for each in placed if each is not None]
+    return None if len(whole) < len(placed) or _some_hidden(settings, whole) else whole
+
+
+@dataclass(frozen=True)
+class _Rest:
+    """A model in its `number`-th resting orientation: vertices (N, 3) and the sides (2,) of the rectangle around it."""
+
+    number: int
+    vertices: np.ndarray
+    sides: np.ndarray
+
+    def at(self, centre: np.ndarray, yaw: float) -> np.ndarray:
+        """(N, 3) its vertices at a place, in metres; those of `_put_at` but for rounding."""
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        flat = self.vertices[:, :2] @ np.array([[cosine, sine], [-sine, cosine]]) + centre
+        return np.column_stack([flat, self.vertices[:, 2]])
+
+
+@lru_cache(maxsize=64)
+def _rests(model: ObjectModel) -> list[_Rest]:
+    found = []
+    for number, (_, turn) in enumerate(model.rests):
+        resting = Rotation.from_quat(turn)
+        vertices = resting.apply(model.vertices)
+        vertices[:, 2] += DROP_M - resting.apply(model.touching)[:, 2].min()
+        found.append(_Rest(number, vertices, np.ptp(vertices[:, :2], axis=0)))
+    return found
+
+
 def _put(settings: Settings, model: ObjectModel, class_index: int, rng: np.random.Generator) -> _Placed | None:
     """A random rest, position and yaw; None if the image would cut the object off."""
-    name, resting = model.rests[int(rng.integers(len(model.rests)))]
+    rest = int(rng.integers(len(model.rests)))
     yaw = float(rng.uniform(-np.pi, np.pi))
     (x_low, x_high), (y_low, y_high) = settings.workspace_x, settings.workspace_y
     centre = rng.uniform([x_low, y_low], [x_high, y_high])
+    return _put_at(settings, model, class_index, rest, centre, yaw)
+
+
+def _put_at(
+    settings: Settings, model: ObjectModel, class_index: int, rest: int, centre: np.ndarray, yaw: float
+) -> _Placed | None:
+    """An object in a resting orientation at a place; None if the image would cut it off."""
+    name, resting = model.rests[rest]
     orientation = Rotation.from_euler("z", yaw) * Rotation.from_quat(resting)
     lowest = float(Rotation.from_quat(resting).apply(model.touching)[:, 2].min())
     position = np.array([*centre, DROP_M - lowest])
