@@ -10,14 +10,13 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe, wait
-from typing import Any
 
 from recordings.errors import RecordingError
 from recordings.files import no_room
 from recordings.layout import Key
 from recordings.manifest import Record
 from recordings.plan import Facts
-from recordings.worker import Job
+from recordings.worker import Job, Message, Workshop
 
 TRIES = 3
 """Attempts at an item (or at the start of a worker) before the death of its worker becomes an error."""
@@ -93,7 +92,7 @@ class Pool:
         worker = _Worker(self.job)
         self.workers[worker.connection] = worker
 
-    def _messages(self) -> Iterator[tuple[_Worker, tuple[Any, ...] | None]]:
+    def _messages(self) -> Iterator[tuple[_Worker, Message | None]]:
         """Waits for messages; yields each with its worker, or None as the message of a dead worker."""
         for connection in wait(list(self.workers)):
             worker = self.workers[connection]  # type: ignore[index]
@@ -102,33 +101,22 @@ class Pool:
             except (EOFError, OSError):
                 yield worker, None
 
-    def _handle(
-        self, worker: _Worker, message: tuple[Any, ...] | None, queue: deque[Task]
-    ) -> tuple[Key, Record] | None:
+    def _handle(self, worker: _Worker, message: Message | None, queue: deque[Task]) -> tuple[Key, Record] | None:
         if message is None:
             self._replace(worker, queue)
             return None
-        kind, *content = message
-        if kind == "ready":
-            self.facts = content[0]
+        if message[0] == "ready":
+            self.facts = message[1]
             worker.ready = True
             self.deaths[None] = 0
             return None
-        if kind == "failed":
-            raise RecordingError(content[0])
-        if kind == "disk":
-            raise no_room(OSError(content[0], ""), content[1])
-        task = worker.take()
-        if kind == "differs":
-            raise RecordingError(
-                f"{self._name(task.key)} came out with other bytes than those recorded in {self.job.root}: it was made "
-                "with other versions or on another kind of processor; repair it there, or generate the data again"
-            )
+        done = finished(message, self.job, worker.task)
+        worker.take()
         if self.recycle is not None and worker.made >= self.recycle:
             del self.workers[worker.connection]
             worker.stop()
             worker.end()
-        return task.key, Record(checksum=content[0], notes=content[1])
+        return done
 
     def _replace(self, worker: _Worker, queue: deque[Task]) -> None:
         """Removes a dead worker and puts its item at the front of the queue, or raises after `TRIES` deaths."""
@@ -137,13 +125,58 @@ class Pool:
         key = worker.task.key if worker.task else None
         self.deaths[key] += 1
         if self.deaths[key] >= TRIES:
-            what = f"making {self._name(key)}" if key else "starting"
+            what = f"making {_name(self.job, key)}" if key else "starting"
             raise RecordingError(f"a worker died {TRIES} times while {what} ({_cause(code)}): {worker.last_line()}")
         if worker.task:
             queue.appendleft(worker.task)
 
-    def _name(self, key: Key) -> str:
-        return f"{self.job.item} {key[0]}/{key[1]}"
+
+class Alone:
+    """Makes items in this process: for few small ones, where starting workers would take longer. As `Pool`."""
+
+    def __init__(self, job: Job) -> None:
+        self.job, self.workshop = job, Workshop(job)
+
+    def __enter__(self) -> Alone:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.workshop.close()
+
+    def start(self) -> Facts:
+        """The facts of the maker."""
+        kind, content = self.workshop.ready()
+        if kind == "failed":
+            raise RecordingError(content)
+        facts: Facts = content
+        return facts
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[tuple[Key, Record]]:
+        """Makes all items in their order."""
+        for task in tasks:
+            message = self.workshop.make(*task.key, task.expected)
+            assert message is not None
+            yield finished(message, self.job, task)
+
+
+def finished(message: Message, job: Job, task: Task | None) -> tuple[Key, Record]:
+    """The finished item that a message tells of.
+
+    Raises:
+        RecordingError: it tells of a failure.
+    """
+    kind, *content = message
+    if kind == "failed":
+        raise RecordingError(content[0])
+    if kind == "disk":
+        raise no_room(OSError(content[0], ""), content[1])
+    assert task is not None
+    if kind == "differs":
+        raise RecordingError(
+            f"{_name(job, task.key)} came out with other bytes than those recorded in {job.root}: it was made with "
+            "other versions or on another kind of processor; repair it there, or generate the data again"
+        )
+    return task.key, Record(checksum=content[0], notes=content[1])
 
 
 class _Worker:
@@ -180,11 +213,9 @@ class _Worker:
         self.task = task
         self._send((*task.key, task.expected))
 
-    def take(self) -> Task:
-        task, self.task = self.task, None
-        assert task is not None
+    def take(self) -> None:
+        self.task = None
         self.made += 1
-        return task
 
     def _send(self, message: object) -> None:
         try:
@@ -213,6 +244,10 @@ class _Worker:
         self.log.seek(0)
         lines = self.log.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else "it printed nothing"
+
+
+def _name(job: Job, key: Key) -> str:
+    return f"{job.item} {key[0]}/{key[1]}"
 
 
 def _cause(code: int) -> str:

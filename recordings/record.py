@@ -32,7 +32,7 @@ from recordings.manifest import (
     write_manifest,
 )
 from recordings.plan import Facts, Kind, Maker, Plan, S
-from recordings.pool import Pool, Task
+from recordings.pool import Alone, Pool, Task
 from recordings.progress import progress
 from recordings.readme import README
 from recordings.verify import Damage, check, mismatches, note_verified, verify
@@ -62,7 +62,7 @@ def record(
         root: the folder; made if it does not exist.
         plan: what it shall hold.
         maker: makes the items, in worker processes.
-        workers: number of processes; None: one per core.
+        workers: number of processes; None: one per core; 0: this process makes all items.
         shown: whether progress is shown on stderr.
         recycle: items after which a worker is replaced, for makers whose memory grows; None: never.
 
@@ -70,7 +70,7 @@ def record(
         RecordingError: the folder has other content, the disk is full, an item cannot be made, or workers keep dying.
     """
     root = root.absolute()
-    if type(maker).__module__ == "__main__":
+    if workers != 0 and type(maker).__module__ == "__main__":
         raise ValueError(f"{type(maker).__name__} stands in the main script: workers can only import it from a module")
     if (root / MANIFEST).exists():
         return check(root, plan.kind, plan)
@@ -78,7 +78,7 @@ def record(
     with _locked(root):
         if (root / MANIFEST).exists():  # another process made it while this one waited
             return check(root, plan.kind, plan)
-        return _complete(root, plan, maker, workers or cores(), shown, recycle)
+        return _complete(root, plan, maker, cores() if workers is None else workers, shown, recycle)
 
 
 def repair(
@@ -107,7 +107,7 @@ def repair(
                 f"{root / MANIFEST} is damaged and {kind.journal} is missing: delete the folder, if it holds nothing "
                 "else, and generate the data again"
             ) from None
-    workers = workers or cores()
+    workers = cores() if workers is None else workers
     with _locked(root):
         try:
             manifest = read_manifest(root, kind)
@@ -179,7 +179,7 @@ def _complete(root: Path, plan: Plan[S], maker: Maker, workers: int, shown: bool
     check_room(root, layout, name)
     missing = [key for key in layout.all_keys() if key not in records]
     if missing or facts is None:
-        with Pool(_job(root, plan, maker), workers, recycle) as pool:
+        with _pool(_job(root, plan, maker), workers, recycle) as pool:
             facts = _agreed(root, facts, pool.start())
             with closing(Journal(root, plan, facts, records)) as journal:
                 if not records:
@@ -209,7 +209,7 @@ def _remake(
     plan = manifest.plan
     allocate(root, plan.layout, plan.kind.name)
     if bad:
-        with Pool(_job(root, plan, maker_for(plan, manifest.facts)), workers, recycle) as pool:
+        with _pool(_job(root, plan, maker_for(plan, manifest.facts)), workers, recycle) as pool:
             tasks = [Task(key, manifest.records[key].checksum) for key in bad]
             for _ in _made(root, plan, pool, tasks, shown):
                 pass
@@ -222,7 +222,13 @@ def _job(root: Path, plan: Plan[S], maker: Maker) -> Job:
     return Job(root, plan.layout, plan.kind.item, plan.kind.notes, maker)
 
 
-def _made(root: Path, plan: Plan[S], pool: Pool, tasks: list[Task], shown: bool) -> Iterator[tuple[Key, Record]]:
+def _pool(job: Job, workers: int, recycle: int | None) -> Pool | Alone:
+    return Pool(job, workers, recycle) if workers else Alone(job)
+
+
+def _made(
+    root: Path, plan: Plan[S], pool: Pool | Alone, tasks: list[Task], shown: bool
+) -> Iterator[tuple[Key, Record]]:
     title = f"{plan.kind.name} {root.name}"
     with progress(title, len(tasks), plan.kind.items, shown=shown and bool(tasks)) as advance:
         for key, record in pool.run(tasks):

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from recordings import MANIFEST, read_journal, verify
@@ -15,20 +19,43 @@ from sims.p2d.store import KIND, SPLITS, read_manifest
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command; returns the exit code: 0 done, 1 failed or damage found, 2 wrong settings, 130 interrupted."""
+    """Runs one command; returns the exit code: 0 done, 1 failed or damage found, 2 wrong settings, 130 Ctrl-C, 143 SIGTERM."""
     options = _parser().parse_args(arguments)
     try:
-        code: int = options.run(options)
+        with _terminable():
+            code: int = options.run(options)
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
     except SimError as error:
         print(error, file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("interrupted; finished trajectories are kept, run the same command to resume", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as stop:
+        what = "terminated" if isinstance(stop, _Terminated) else "interrupted"
+        print(f"{what}; finished trajectories are kept, run the same command to resume", file=sys.stderr)
+        return 143 if isinstance(stop, _Terminated) else 130
     return code
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM came."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Ends the work in order on SIGTERM too, as a scheduler sends it."""
+
+    def stop(*_: object) -> None:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _make(options: argparse.Namespace) -> int:

@@ -36,7 +36,7 @@ JOURNAL = "squares.jsonl"
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("made") / "squares"
-    record(root, plan(), Squares(), workers=1, shown=False)
+    record(root, plan(), Squares(), workers=0, shown=False)
     return root
 
 
@@ -47,7 +47,7 @@ def root(made: Path, tmp_path: Path) -> Path:
 
 
 def mended(root: Path) -> list[str]:
-    return repair(root, KIND, lambda plan, facts: Squares(plan.settings["seed"]), workers=1, shown=False).lines()
+    return repair(root, KIND, lambda plan, facts: Squares(plan.settings["seed"]), workers=0, shown=False).lines()
 
 
 def test_arrays_notes_and_manifest_read_back(made: Path):
@@ -82,14 +82,14 @@ def test_an_interrupted_recording_is_resumed_to_the_same_bytes(
     with monkeypatch.context() as patch:
         patch.setenv("SQUARES_REFUSE", "train-3")
         with pytest.raises(RecordingError, match=r"^this square cannot be made$"):
-            record(root, plan(), Squares(), workers=1, shown=False)
+            record(root, plan(), Squares(), workers=0, shown=False)
     with pytest.raises(RecordingError, match=r"not finished \(3 of 7 squares made\): resume with make squares in"):
         read_manifest(root, KIND)
     with pytest.raises(RecordingError, match=r"started with other settings \(seed is 0 there and 1 here\)"):
-        record(root, plan(seed=1), Squares(1), workers=1, shown=False)
+        record(root, plan(seed=1), Squares(1), workers=0, shown=False)
     later = dataclasses.replace(KIND, version=2)
     with pytest.raises(RecordingError, match=r"started by another version of this program: generate the data again"):
-        record(root, plan(kind=later), Squares(), workers=1, shown=False)
+        record(root, plan(kind=later), Squares(), workers=0, shown=False)
     monkeypatch.setenv("SQUARES_LOG", str(log))
     record(root, plan(), Squares(), workers=2, shown=False)
     assert sorted(path.name for path in log.iterdir()) == ["extra-0", "extra-1", "train-3", "train-4"]
@@ -183,12 +183,12 @@ def test_repairing_another_folder_leaves_nothing_behind(tmp_path: Path):
 def test_a_file_that_the_maker_misses_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("SQUARES_UNREADABLE", "1")
     with pytest.raises(RecordingError, match=r"^/no such folder/palette cannot be used \(No such file or directory\)"):
-        record(tmp_path / "a", plan(), Squares(), workers=1, shown=False)
+        record(tmp_path / "a", plan(), Squares(), workers=0, shown=False)
 
 
 def test_an_item_that_does_not_fit_is_refused(tmp_path: Path):
     with pytest.raises(RecordingError, match=r"square field rgb is \|u1 \(2, 3, 3, 3\), not \|u1 \(2, 4, 4, 3\)"):
-        record(tmp_path, plan(), Squares(side=3), workers=1, shown=False)
+        record(tmp_path, plan(), Squares(side=3), workers=0, shown=False)
 
 
 def test_a_maker_of_the_main_script_is_refused(tmp_path: Path):

@@ -215,16 +215,22 @@ def test_two_processes_generate_every_trajectory_once(tmp_path: Path, unbroken: 
 
 
 @linux
-def test_ctrl_c_ends_cleanly_and_the_same_command_resumes(tmp_path: Path, unbroken: dict[str, bytes]):
+@pytest.mark.parametrize(
+    ("number", "code", "word"),
+    [(signal.SIGINT, 130, "interrupted"), pytest.param(signal.SIGTERM, 143, "terminated", marks=pytest.mark.slow)],
+)
+def test_a_stop_ends_cleanly_and_the_same_command_resumes(
+    tmp_path: Path, unbroken: dict[str, bytes], number: int, code: int, word: str
+):
     command = ("--out", tmp_path, *words(small()), "--workers", 2, "--no-card")
     process = start(*command, FAKE_SLEEP_S=0.3)
     _wait_for_lines(tmp_path / KIND.journal, 3, process)
     workers = children(process.pid)
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, number)
     _, text = process.communicate(timeout=120)
-    assert process.returncode == 130
+    assert process.returncode == code
     assert "Traceback" not in text
-    assert "run the same command to resume" in text
+    assert f"{word}; finished trajectories are kept, run the same command to resume" in text
     assert workers
     _wait_until_gone(workers)
     again = start(*command)
