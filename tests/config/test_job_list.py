@@ -51,11 +51,11 @@ def test_an_interval_is_refused() -> None:
 
 @pytest.mark.usefixtures("hydra")
 @pytest.mark.parametrize(
-    ("sweep", "number"), [("segmentation", 28), ("tracking", 20), ("ablations", 28), ("arrangement", 4), ("paper", 48)]
+    ("sweep", "number"), [("segmentation", 28), ("tracking", 20), ("ablations", 28), ("arrangement", 7), ("paper", 55)]
 )
 def test_the_paper_s_sweeps(sweep: str, number: int) -> None:
     jobs = expand([f"+sweep={sweep}", "scale=smoke"])
-    assert len(jobs) == number  # paper: 6 models and 5 ablations x 4 seeds, 4 classical methods
+    assert len(jobs) == number  # paper: 6 models and 5 ablations x 4 seeds, 4 classical methods, 7 jobs of the arrangement task
     assert all(job[-1] == "scale=smoke" for job in jobs)
     assert len({(made.choices["model"], made.raw["seed"]) for made in composed("train", jobs[:4])}) == 4
 
@@ -63,8 +63,8 @@ def test_the_paper_s_sweeps(sweep: str, number: int) -> None:
 @pytest.mark.usefixtures("hydra")
 def test_the_command_s_words_replace_those_of_the_list() -> None:
     assert expand(["+sweep=arrangement", "seed=1,2", "model=apex"]) == [
-        ("seed=1", "model=apex"),
-        ("seed=2", "model=apex"),
+        ("data=arrangement", "seed=1", "model=apex"),
+        ("data=arrangement", "seed=2", "model=apex"),
     ]
     assert len(expand(["+sweep=ablations", "+ablation=gaussian", "seed=0", "model=apex"])) == 1
 

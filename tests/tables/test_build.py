@@ -300,7 +300,9 @@ def test_yardsticks_stand_below_and_test_the_evaluation(tmp_path: Path) -> None:
         assert [each.seeds for each in table.lines][-4:] == ["0 of 1", "0 of 1", "1", "1"]
         assert all(cell.published is None for each in table.lines[-4:] for cell in each.cells.values())
         assert not any(each.notes for each in table.lines[-4:])
-    assert len(only(tmp_path, 4, yardsticks=True).lines) == 4
+    four = only(tmp_path, 4, yardsticks=True)
+    assert [each.name for each in four.lines][:4] == ["SPACE", "SCALOR", "G-SWM", "APEX"]
+    assert len(four.lines) == 8
 
 
 def test_an_oracle_that_is_not_perfect_is_told(tmp_path: Path) -> None:
@@ -408,3 +410,24 @@ def test_what_the_paper_says_of_its_data_is_said_of_no_other(tmp_path: Path) -> 
 def test_the_scores_of_the_hand_made_runs_obey_the_identities() -> None:
     assert SCORES["match"] - SCORES["fps"] == SCORES["mota"]
     assert SCORES["match"] + SCORES["id_switches"] + SCORES["misses"] == 100
+
+
+def test_a_table_shows_runs_of_its_own_data_where_runs_for_several_tables_are_asked_for(tmp_path: Path) -> None:
+    folder = run_folder(tmp_path, "apex", 0, data="arrangement")
+    tasks = {"2": {"objects": 6, "failures": {"fell": 2, "wrong match": 1}}, "3": {"objects": 3, "failures": {}}}
+    (folder / "arrangement.json").write_text(json.dumps({"distances_m": SCENARIOS, "tasks": tasks}))
+    run_folder(tmp_path, "apex", 0)
+    both = [job(tmp_path, "apex", 0), job(tmp_path, "apex", 0, data="arrangement")]
+    tables, found = made(tmp_path, tables=(1, 4), jobs=both, published=True)
+    one, four = (next(table for table in tables if table.number == number) for number in ("1", "4"))
+    assert [(each.label, each.configuration.data) for each in one.lines] == [("APEX", "p2d")]
+    assert [(each.label, each.configuration.data) for each in four.lines] == [("APEX", "arrangement")]
+    assert four.lines[0].cells["2"].published == (0.04, 0.10)
+    assert "In parentheses: the paper's values" in four.caption
+    assert four.lines[0].notes[-1] == (
+        "objects away from their goals, seed 0: 3 of 6 with 2 objects (fell 2, wrong match 1); 0 of 3 with 3 objects."
+    )
+    assert found == ()
+    (alone,) = made(tmp_path, tables=(4,), jobs=both[:1], published=True)[0]
+    assert [each.label for each in alone.lines] == ["APEX, data=p2d"]
+    assert alone.lines[0].cells["2"].published is None

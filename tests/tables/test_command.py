@@ -35,7 +35,7 @@ def test_without_words_every_table_of_the_paper(tables: Callable[..., Ended], tm
     for number in ("1", "2", "2b", "3", "4"):
         assert f"## Table {number}\n" in ended.out
     assert "python -m apex_lab.train +sweep=paper -m " in ended.out
-    assert ended.out.count("python -m apex_lab.train model=") == 15
+    assert ended.out.count("python -m apex_lab.train model=") == 22
     assert "python -m apex_lab.train model=scalor seed=0,1,2,3 -m " in ended.out
     assert "python -m apex_lab.train model=apex +ablation=no_entropy seed=0,1,2,3 -m " in ended.out
     assert "scale=" not in ended.out
@@ -143,7 +143,7 @@ def test_damaged_files_are_told_and_do_not_stop_anything(
     damaged.write_text("")
     ended = tables(*words, "dry_run=true", "tables=[1]")
     assert ended.code == 0
-    assert f"- APEX: seed 0 failed: {damaged} cannot be read" in ended.out
+    assert f"- APEX, data=arrangement: seed 0 failed: {damaged} cannot be read" in ended.out
 
 
 SMALL = ("+sweep=arrangement", "model=oracle", "tables=[1]")

@@ -10,6 +10,8 @@ import pytest
 from apex_lab.tables.missing_runs import Command, missing_runs
 from tests.tables.folders import job, jobs, made, run_folder
 
+YARDSTICKS = ("color_clusters", "background_subtraction", "oracle", "one_segment")
+
 
 def commands(outputs: Path, **asked: Any) -> tuple[Command, ...]:
     return made(outputs, **asked)[1]
@@ -30,7 +32,7 @@ def test_an_empty_folder_gives_every_command(tmp_path: Path) -> None:
         ),
         *(
             f"{train}{model} seed=0 scale=paper"
-            for model in ("color_clusters", "background_subtraction", "oracle", "one_segment")
+            for model in YARDSTICKS
         ),
         *(
             f"{train}apex +ablation={ablation} seed=0,1,2,3 scale=paper -m"
@@ -38,13 +40,13 @@ def test_an_empty_folder_gives_every_command(tmp_path: Path) -> None:
         ),
         *(
             f"python -m apex_lab.arrange checkpoint={tmp_path}/{model}_p2d_paper_0123abcd/seed_0"
-            for model in ("space", "scalor", "gswm", "apex")
+            for model in ("space", "scalor", "gswm", "apex", *YARDSTICKS)
         ),
     ]
     assert of(found, "SCALOR").remarks == ("SCALOR, tables 1, 2, 2b, 4",)
     assert of(found, "APEX").remarks == ("APEX, tables 1, 2, 2b, 3, 4",)
-    assert of(found, "Oracle").remarks == ("Oracle, tables 1, 2, 2b, 3",)
-    assert found[-1].remarks == ("APEX, table 4", "not in this version")
+    assert of(found, "Oracle").remarks == ("Oracle, tables 1, 2, 2b, 3, 4",)
+    assert found[-1].remarks == ("One segment, data=p2d, table 4",)
 
 
 def test_only_what_is_missing_unfinished_or_damaged(tmp_path: Path) -> None:
@@ -112,7 +114,7 @@ def test_arranging_needs_one_seed_that_has_not_failed(tmp_path: Path) -> None:
     run_folder(tmp_path, "gswm", 0, foreground_share=0.0)
     run_folder(tmp_path, "gswm", 1, foreground_share=0.3)
     tables, _ = made(tmp_path, tables=(4,))
-    found = missing_runs(tables, None, ("gswm",), arrange=True)
-    assert [str(command) for command in found if "G-SWM, table 4" in command.remarks and "arrange" in command.text] == [
-        f"python -m apex_lab.arrange checkpoint={tmp_path}/gswm_p2d_paper_0123abcd/seed_1  # G-SWM, table 4"
+    found = missing_runs(tables, None, ("gswm",))
+    assert [str(command) for command in found if command.remarks[0].startswith("G-SWM, ") and "arrange" in command.text] == [
+        f"python -m apex_lab.arrange checkpoint={tmp_path}/gswm_p2d_paper_0123abcd/seed_1  # G-SWM, data=p2d, table 4"
     ]

@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from apex_lab.data.arrangement import ArrangementClips, ArrangementSource
     from apex_lab.data.clips import ClipSampler
     from apex_lab.data.loaders import training_loader, whole_loader
     from apex_lab.data.own_videos.source import OwnVideosSource
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from apex_lab.data.video_set import Clip, Item, VideoSet
 
 _MODULES = {
+    "arrangement": ["ArrangementClips", "ArrangementSource"],
     "clips": ["ClipSampler"],
     "loaders": ["training_loader", "whole_loader"],
     "own_videos.source": ["OwnVideosSource"],
@@ -37,6 +39,8 @@ _MODULES = {
 
 __all__ = [
     "P2D",
+    "ArrangementClips",
+    "ArrangementSource",
     "Clip",
     "ClipSampler",
     "Item",

@@ -7,7 +7,6 @@ python -m apex_lab.tables scale=cpu tables=[1,3]       keys of its own: conf/tab
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -197,9 +196,8 @@ def assemble(job: Tables) -> Made:
     if not tables:
         raise UserError(f"None of these jobs has a row in a table: {' '.join(job.words)}.")
     all_shown = {line.configuration.name for table in tables for line in table.lines} == {row.name for row in rows}
-    arrange = importlib.util.find_spec("apex_lab.arrange") is not None
     words = job.words if all_shown else None
-    commands = missing_runs(tables, words, job.asked.exclude_failed, arrange, job.config_dir)
+    commands = missing_runs(tables, words, job.asked.exclude_failed, job.config_dir)
     return Made(tuple(tables), tuple(commands))
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from apex_lab.tables.configurations import DATA, SCALE, Configuration, difference
+from apex_lab.tables.configurations import SCALE, Configuration, difference
 from apex_lab.tables.definition import Column, Row, Section, Specification, Table
 from apex_lab.tables.found import Protocol, and_list
 from apex_lab.tables.rows import DDOF, TRACKING, Line, Options, make_line, rounded
@@ -54,6 +54,7 @@ def build(
         configurations: of the jobs.
         options: of the command.
     """
+    configurations = _of_table(table, specification, configurations)
     sections = _sections(table, specification, configurations, options)
     if not any(section.rows for section in sections):
         return []
@@ -69,6 +70,14 @@ def build(
         variant = _build(again, renamed, specification, configurations, options)
         built.append(replace(variant, number=table.variant.number))
     return built
+
+
+def _of_table(
+    table: Table, specification: Specification, configurations: Sequence[Configuration]
+) -> list[Configuration]:
+    """Those that are not meant for a table with other data; all where none would be left."""
+    others = {other.data for other in specification.tables} - {table.data}
+    return [each for each in configurations if each.data not in others] or list(configurations)
 
 
 def _sections(
@@ -212,7 +221,7 @@ def _caption(
             f"Mean ± standard deviation (ddof = {DDOF}) over {over} of all seeds that the last column counts; "
             "an object that fell off the table counts as 1 m"
         )
-    if options.published and DATA in data:
+    if options.published and table.data in data:
         parts.append("In parentheses: the paper's values")
         if others:
             parts[-1] += f", which are of scale {SCALE} and cannot be compared with scale {and_list(others)}"

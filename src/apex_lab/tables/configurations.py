@@ -15,7 +15,7 @@ from apex_lab.tables.found import Protocol, SeedRun, read_run
 
 T = TypeVar("T")
 
-DATA, SCALE = "p2d", "paper"
+SCALE = "paper"
 """Of the paper; rows of others say so."""
 
 _SHORT = {group: name for name, group in SHORT.items()}
@@ -58,10 +58,13 @@ class Configuration:
         """Those that are asked for."""
         return tuple(self.jobs)
 
-    @property
-    def told(self) -> tuple[str, ...]:
-        """Words that say how it differs from what the paper ran."""
-        data = [f"data={self.data}"] if self.data != DATA else []
+    def told(self, usual: str) -> tuple[str, ...]:
+        """Words that say how it differs from what the paper ran.
+
+        Args:
+            usual: the paper's data.
+        """
+        data = [f"data={self.data}"] if self.data != usual else []
         scale = [f"scale={self.scale}"] if self.scale != SCALE else []
         return (*data, *scale, *self.changes)
 

@@ -13,6 +13,9 @@ import apex_lab
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence, validate
 
+DATA = "p2d"
+"""What the paper's tables of scores were made from."""
+
 Published = tuple[float, float]
 """Mean and standard deviation as the paper prints them."""
 
@@ -82,12 +85,14 @@ class Variant(_Part):
 class Table(_Part):
     """One table of the paper.
 
-    `source`: metrics.json or arrangement.json of the runs. `seeds`: where it needs fewer than its jobs have.
+    `source`: metrics.json or arrangement.json of the runs. `data`: the paper's for this table; rows of other data say
+    so. `seeds`: where it needs fewer than its jobs have.
     """
 
     number: int
     caption: str
     source: Literal["metrics", "arrangement"]
+    data: str = DATA
     decimals: int = Field(ge=0)
     arrows: bool
     yardsticks: bool

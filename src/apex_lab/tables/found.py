@@ -149,6 +149,23 @@ def read_arrangement(run: SeedRun) -> dict[str, list[list[float]]] | None:
     return found
 
 
+def read_failures(run: SeedRun) -> dict[str, tuple[int, int, dict[str, int]]]:
+    """Why objects are not at their goals at the end, by number of objects; none where the file does not tell.
+
+    Returns:
+        Number of objects -> how many are away, of how many, and how many for each reason.
+    """
+    tasks = read_json(run.folder / "arrangement.json").get("tasks")
+    found = {}
+    for objects, task in tasks.items() if isinstance(tasks, dict) else ():
+        try:
+            reasons = {str(reason): int(count) for reason, count in task["failures"].items()}
+            found[str(objects)] = (sum(reasons.values()), int(task["objects"]), reasons)
+        except (KeyError, TypeError, ValueError, AttributeError):
+            continue
+    return found
+
+
 def _record(file: Path, seed: int, known: Mapping[str, Any] | None) -> Record:
     if not known and not file.is_file():
         raise UserError(f"{file} is missing: run the command of this run again.")

@@ -108,7 +108,7 @@ def _heading(column: Column, arrows: bool) -> str:
 
 
 def _label(line: Line) -> str:
-    told = "".join(f", {word}" for word in line.configuration.told)
+    told = "".join(f", {word}" for word in line.told)
     return (f"{line.latex}{escape(told)}" if line.latex else escape(line.label)) + ("*" if line.asterisk else "")
 
 

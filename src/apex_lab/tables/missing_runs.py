@@ -12,7 +12,6 @@ from apex_lab.tables.rows import Line
 
 TRAIN = "python -m apex_lab.train"
 ARRANGE = "python -m apex_lab.arrange"
-ABSENT = "not in this version"
 RETRY = "hydra.sweeper.retry_failed=true"
 
 
@@ -31,7 +30,6 @@ def missing_runs(
     tables: Sequence[Built],
     words: Sequence[str] | None,
     exclude_failed: Collection[str],
-    arrange: bool,
     config_dir: str | None = None,
 ) -> list[Command]:
     """The commands for everything that the tables lack: all of it at once, then row by row, trainings first.
@@ -40,7 +38,6 @@ def missing_runs(
         tables: all of them.
         words: those that name the jobs, where all jobs are in the tables.
         exclude_failed: models whose failed seeds do not count.
-        arrange: whether this version has the arrangement task.
         config_dir: a further folder of configuration files.
     """
     options = ["--config-dir", config_dir] if config_dir else []
@@ -59,7 +56,7 @@ def missing_runs(
     for table in tables:
         if table.source == "arrangement":
             for line in table.lines:
-                commands += _arrangements(line, exclude_failed, arrange, table.number)
+                commands += _arrangements(line, exclude_failed, table.number)
     return commands
 
 
@@ -100,14 +97,14 @@ def _seeded(configuration: Configuration, seeds: Sequence[int]) -> list[str]:
     return [seed if word.startswith("seed=") else word for word in words]
 
 
-def _arrangements(line: Line, exclude_failed: Collection[str], arrange: bool, number: str) -> list[Command]:
+def _arrangements(line: Line, exclude_failed: Collection[str], number: str) -> list[Command]:
     """One command per seed whose results of the arrangement task are missing."""
     configuration = line.configuration
     lacking = len(line.wanted) - len(line.counted)
     useless = {s for s, run in configuration.runs.items() if run.failure and line.row.model in exclude_failed}
     seeds = dict.fromkeys([*line.wanted, *configuration.seeds])
     free = [seed for seed in seeds if seed not in {*line.counted, *useless}]
-    remarks = (f"{line.label}, table {number}", *(() if arrange else (ABSENT,)))
+    remarks = (f"{line.label}, table {number}",)
     folders = [configuration.folders[seed] for seed in free[: max(0, lacking)]]
     return [Command(_typed(ARRANGE, [f"checkpoint={folder}"]), remarks) for folder in folders]
 

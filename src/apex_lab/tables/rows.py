@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from apex_lab.base.errors import UserError
-from apex_lab.tables.configurations import DATA, Configuration
+from apex_lab.tables.configurations import Configuration
 from apex_lab.tables.definition import Column, Published, Row, Specification, Table
-from apex_lab.tables.found import Protocol, SeedRun, and_list, read_arrangement
+from apex_lab.tables.found import Protocol, SeedRun, and_list, read_arrangement, read_failures
 
 DDOF = 1
 """Seeds are a sample: deviations divide by n - 1 (metrics.md section 3)."""
@@ -83,6 +83,7 @@ class Line:
         configuration: what was run.
         name: what the paper calls it.
         label: its name, without an asterisk; what differs from the paper's data, scale and settings is in it.
+        told: what differs from the paper's data, scale and settings.
         latex: the name in LaTeX, where that differs, without what differs.
         asterisk: whether a footnote marked * belongs to it.
         tracking: whether its components keep identities; None where nothing tells.
@@ -103,6 +104,7 @@ class Line:
     configuration: Configuration
     name: str
     label: str
+    told: tuple[str, ...]
     latex: str | None
     asterisk: bool
     tracking: bool | None
@@ -167,8 +169,9 @@ def make_line(
     left_out = dict(configuration.left_out)
     counted = tuple(sorted(seed for seed in content.results if seed not in excluded))
     missing = tuple(seed for seed in wanted if seed not in {*configuration.runs, *left_out})
-    if configuration.data != DATA:  # what the paper says of its own data
+    if configuration.data != table.data:  # what the paper says of its own data
         row = row.model_copy(update={"published": {}, "published_excluded": 0, "fails": False})
+    told = configuration.told(table.data)
     columns = [column for column in table.columns if column.key != TRACKING]
     cells = {column.key: _cell(row, column, content.results, counted) for column in columns}
     notes = [
@@ -178,6 +181,7 @@ def make_line(
         *_failures_that_count(runs, counted),
         *_undefined(columns, cells, counted),
         *_unexpected(row, columns, content.results, counted),
+        *(note for seed in counted if table.source == "arrangement" for note in _reasons(seed, runs[seed])),
     ]
     if listed_for_exclusion and any(run.state == "finished" for run in runs.values()):
         notes += _unchecked(runs)
@@ -185,7 +189,8 @@ def make_line(
         row=row,
         configuration=configuration,
         name=specification.label(row),
-        label=", ".join([specification.label(row), *configuration.told]),
+        label=", ".join([specification.label(row), *told]),
+        told=told,
         latex=specification.latex(row),
         asterisk=row.fails or bool(excluded and counted) or (options.published and row.published_excluded > 0),
         tracking=_tracks(row.model, specification, runs),
@@ -234,6 +239,15 @@ def _distances(scenarios: Sequence[Sequence[float]], options: Options) -> tuple[
     if options.arrangement_mean == "object":
         return tuple(distance for scenario in scenarios for distance in scenario)
     return tuple(summarise(scenario).mean for scenario in scenarios)
+
+
+def _reasons(seed: int, run: SeedRun) -> list[str]:
+    """Why objects did not come to their goals."""
+    parts = []
+    for objects, (away, total, reasons) in read_failures(run).items():
+        why = ", ".join(f"{reason} {count}" for reason, count in reasons.items())
+        parts.append(f"{away} of {total} with {objects} objects" + (f" ({why})" if why else ""))
+    return [f"objects away from their goals, seed {seed}: {'; '.join(parts)}."] if parts else []
 
 
 def _fault(run: SeedRun, fault: str | None) -> str | None:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import imageio_ffmpeg
@@ -45,7 +46,9 @@ def movie(path: Path, items: Sequence[Item], fps: float = 5.0) -> None:
     if len({clip.rows for clip in clips}) > 1:
         raise ValueError("items are partly with and partly without segmentation, expected all or none")
     if path.suffix == ".mp4":
-        _write_mp4(path, clips, fps)
+        with mp4(path, fps) as add:
+            for frame in _frames(clips):
+                add(frame)
     elif path.suffix == ".gif":
         _write_gif(path, clips, fps)
     else:
@@ -87,28 +90,44 @@ def _frames(clips: Sequence[Clip]) -> Iterator[Image.Image]:
             yield picture
 
 
-def _write_mp4(path: Path, clips: Sequence[Clip], fps: float) -> None:
-    """ffmpeg needs a file name to write to; what it made is moved into place only if it is whole."""
+@contextlib.contextmanager
+def mp4(path: Path, fps: float) -> Iterator[Callable[[Image.Image], None]]:
+    """A movie to add frames to, all of one even size; it is put in place of `path` at the end, if it is whole.
+
+    Args:
+        path: what to write: H.264, yuv420p, playable in every browser.
+        fps: frames per second.
+
+    Raises:
+        UserError: the file cannot be written, or this system has no ffmpeg.
+    """
     _need_ffmpeg(path)
     try:
+        # ffmpeg needs a file name to write to
         with tempfile.TemporaryDirectory() as folder:
             part = Path(folder) / path.name
-            _encode(part, clips, fps)
+            with _encoding(part, fps) as add:
+                yield add
             with picture_file(path) as file, open(part, "rb") as made:
                 shutil.copyfileobj(made, file)
     except OSError as error:
         raise unwritable(path, error) from error
 
 
-def _encode(path: Path, clips: Sequence[Clip], fps: float) -> None:
+@contextlib.contextmanager
+def _encoding(path: Path, fps: float) -> Iterator[Callable[[Image.Image], None]]:
     count = 0
     encoder = None
+
+    def add(frame: Image.Image) -> None:
+        nonlocal count, encoder
+        if encoder is None:
+            encoder = _encoder(path, frame.size, fps)
+        encoder.send(np.asarray(frame).tobytes())
+        count += 1
+
     try:
-        for frame in _frames(clips):
-            if encoder is None:
-                encoder = _encoder(path, frame.size, fps)
-            encoder.send(np.asarray(frame).tobytes())
-            count += 1
+        yield add
     finally:
         if encoder is not None:
             encoder.close()

@@ -139,6 +139,7 @@ class Gswm(SceneModel):
                 f"model.image_encoder.grid={image_encoder.grid}"
             )
         self.image_size, self.max_objects, self.what, self.scale_std = image_size, max_objects, what, scale_std
+        self.input_size = (image_size, image_size)
         self.discovery_dropout, self.discovery_draw = discovery_dropout, discovery_draw
         self.evaluation = evaluation
         self.each = DEPTH + WHERE + what + dyna

@@ -101,6 +101,7 @@ class Scalor(SceneModel):
     ) -> None:
         super().__init__()
         self.image_size, self.sigma = image_size, sigma
+        self.input_size = (image_size, image_size)
         self.latents, self.readout = latents, readout
         everything = Recompute(recompute == "everything")
         self.recompute = everything
