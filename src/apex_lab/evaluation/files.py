@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import one_line, sentence, validate
+from apex_lab.base.order import natural_path_key
+from apex_lab.base.validation import did_you_mean, one_line, sentence, validate
 from apex_lab.config import components
 from apex_lab.config import schema as config
 from apex_lab.evaluation.other_data import OtherData
-from apex_lab.base.order import natural_path_key
-from apex_lab.runs import checkpoints
+from apex_lab.runs import checkpoints, shipped
 
 Bad = dict[Path, str]
 """What cannot be evaluated -> why, in one sentence."""
@@ -25,8 +25,8 @@ def find(patterns: Sequence[str]) -> tuple[list[Path], Bad]:
     Files that a folder or a pattern names are in natural order: seed_2 before seed_10.
 
     Args:
-        patterns: checkpoint files, run folders (their last checkpoint), folders that hold run folders, or patterns
-            with `*` for any of these.
+        patterns: checkpoint files, run folders (their last checkpoint), folders that hold run folders, patterns with
+            `*` for any of these, or names of shipped weights (`runs.shipped.NAMES`).
 
     Raises:
         UserError: one of them means no checkpoint; of several things that fit a pattern, some may be without.
@@ -133,8 +133,11 @@ def _matches(pattern: str) -> list[Path]:
     path = Path(pattern)
     if path.exists():
         return [path]
+    if pattern in shipped.NAMES:
+        return [shipped.weights(pattern)]
     if not any(mark in pattern for mark in "*?"):
-        raise UserError(f"checkpoint = {pattern} does not exist: give a .ckpt file or a run folder.")
+        hint = did_you_mean(pattern, shipped.NAMES) or ": give a .ckpt file or a run folder"
+        raise UserError(sentence(f"checkpoint = {pattern} does not exist{hint}"))
     start = Path(path.anchor) if path.is_absolute() else Path()
     found = sorted(start.glob(str(path.relative_to(path.anchor))), key=natural_path_key)
     if not found:
