@@ -12,11 +12,11 @@ import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence
-from apex_lab.evaluation.files import find
 from apex_lab.inference.loading import trained_model
 from apex_lab.inference.predictor import Predictor
 from apex_lab.inference.segmenter import Segmenter
 from apex_lab.runs import checkpoints
+from apex_lab.runs.checkpoint_files import find
 from apex_lab.scene import schedule_at
 from apex_lab.videos import Fit
 

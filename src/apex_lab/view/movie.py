@@ -8,14 +8,13 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from apex_lab.base.errors import UserError
 from apex_lab.base.files import unwritable
 from apex_lab.view.canvas import FAINT, GAP, INK, MARGIN, cell_size, fit, font, picture_file, sheet
+from apex_lab.view.encoder import Mp4, ffmpeg
 from apex_lab.view.item import Clip, Item
 
 CELL = 160
@@ -89,72 +88,20 @@ def _frames(clips: Sequence[Clip]) -> Iterator[Image.Image]:
 
 def _write_mp4(path: Path, clips: Sequence[Clip], fps: float) -> None:
     """ffmpeg needs a file name to write to; what it made is moved into place only if it is whole."""
-    _need_ffmpeg(path)
+    ffmpeg()
     try:
         with tempfile.TemporaryDirectory() as folder:
             part = Path(folder) / path.name
-            _encode(part, clips, fps)
-            with picture_file(path) as file, open(part, "rb") as made:
-                shutil.copyfileobj(made, file)
+            frames = _frames(clips)
+            first = np.asarray(next(frames))
+            with Mp4(part, (first.shape[0], first.shape[1]), fps) as made:
+                made.add(first)
+                for frame in frames:
+                    made.add(np.asarray(frame))
+            with picture_file(path) as file, open(part, "rb") as whole:
+                shutil.copyfileobj(whole, file)
     except OSError as error:
         raise unwritable(path, error) from error
-
-
-def _encode(path: Path, clips: Sequence[Clip], fps: float) -> None:
-    count = 0
-    encoder = None
-    try:
-        for frame in _frames(clips):
-            if encoder is None:
-                encoder = _encoder(path, frame.size, fps)
-            encoder.send(np.asarray(frame).tobytes())
-            count += 1
-    finally:
-        if encoder is not None:
-            encoder.close()
-    # ffmpeg may fail at its last write, when nobody listens any more
-    if (written := _count(path)) != count:
-        raise OSError(f"ffmpeg wrote {written} of {count} frames")
-
-
-def _count(path: Path) -> int:
-    """Frames of a movie; 0 if it cannot be read."""
-    if not path.exists():
-        return 0
-    try:
-        return imageio_ffmpeg.count_frames_and_secs(str(path))[0]
-    except RuntimeError:  # what imageio_ffmpeg raises for a file that ffmpeg cannot open
-        return 0
-
-
-def _need_ffmpeg(path: Path) -> None:
-    try:
-        program = imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError:
-        program = "ffmpeg"
-    if shutil.which(program) is None:
-        raise UserError(
-            f"{path.name} cannot be made, {program} is no program: "
-            "install ffmpeg and set the variable IMAGEIO_FFMPEG_EXE to where it is"
-        )
-
-
-def _encoder(path: Path, size: tuple[int, int], fps: float):  # type: ignore[no-untyped-def]  # imageio_ffmpeg has no types
-    """A started ffmpeg that takes RGB frames."""
-    encoder = imageio_ffmpeg.write_frames(
-        str(path),
-        size,
-        fps=fps,
-        codec="libx264",
-        pix_fmt_out="yuv420p",
-        quality=None,
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-        # near-lossless, so that thin outlines survive; the index in front, so that browsers start at once
-        output_params=["-crf", "16", "-preset", "slow", "-movflags", "+faststart", "-threads", "1"],
-    )
-    encoder.send(None)
-    return encoder
 
 
 def _write_gif(path: Path, clips: Sequence[Clip], fps: float) -> None:
