@@ -69,6 +69,7 @@ def segmenter_of(
     fit: Fit,
     full_size: bool = True,
     detail: bool = False,
+    labels: bool = False,
 ) -> Segmenter:
     """The model of a checkpoint that has been read.
 
@@ -77,6 +78,7 @@ def segmenter_of(
         content: as `checkpoints.load` gives it.
         device: where the model runs.
         fit, full_size, detail: as of `load`.
+        labels: models that read the ground truth are allowed.
 
     Raises:
         UserError: the model cannot be built, or reads the ground truth.
@@ -86,7 +88,7 @@ def segmenter_of(
         model = trained_model(inference)
     except UserError as error:
         raise UserError(sentence(f"{file}: {one_line(error)}")) from error
-    if model.needs_labels:
+    if model.needs_labels and not labels:
         raise UserError(
             f"{file} holds {type(model).__name__}, which reads the ground truth: give a model that looks at videos."
         )
