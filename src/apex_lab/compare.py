@@ -69,7 +69,11 @@ class Comparison:
 
 def main() -> None:
     """Entry point: `python -m apex_lab.compare`."""
-    cli.launch(cli.Command("compare", check_comparison, compare, title, literal=("video", "folder"), any_data=True))
+    cli.launch(
+        cli.Command(
+            "compare", check_comparison, compare, title, literal=("video", "folder"), any_data=True, model_groups=False
+        )
+    )
 
 
 def title(job: Comparison) -> str:

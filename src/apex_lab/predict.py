@@ -70,7 +70,11 @@ class Prediction:
 
 def main() -> None:
     """Entry point: `python -m apex_lab.predict`."""
-    cli.launch(cli.Command("predict", check_prediction, predict, title, literal=("checkpoint", "video", "folder")))
+    cli.launch(
+        cli.Command(
+            "predict", check_prediction, predict, title, literal=("checkpoint", "video", "folder"), model_groups=False
+        )
+    )
 
 
 def title(job: Prediction) -> str:

@@ -67,6 +67,7 @@ class Command:
             Hydra; lists in brackets and values in quotes are left to it.
         any_data: words that set keys of `data` are passed on though no file has such keys, since a checkpoint brings
             the data's settings; the check knows which exist.
+        model_groups: the command composes models, so short names of their groups (`masks=scalor`) are understood.
     """
 
     config_name: str
@@ -77,6 +78,7 @@ class Command:
     reseeded: Callable[[Any, Composed], Any] | None = None
     literal: tuple[str, ...] = ()
     any_data: bool = False
+    model_groups: bool = True
 
 
 def launch(command: Command) -> None:
@@ -116,7 +118,9 @@ def launch(command: Command) -> None:
         ended.append((state, str(error)))
         return state
 
-    sys.argv[1:] = full_names(_options_last([_quoted(word, command.literal) for word in sys.argv[1:]]))
+    sys.argv[1:] = _options_last([_quoted(word, command.literal) for word in sys.argv[1:]])
+    if command.model_groups:
+        sys.argv[1:] = full_names(sys.argv[1:])
     if command.any_data:
         sys.argv[1:] = [f"++{word}" if word.startswith("data.") else word for word in sys.argv[1:]]
     sweep = Sweep([], command.known)

@@ -110,11 +110,11 @@ def _shown(model: Model, batch: Batch) -> Shown:
     scene = model.predictor(batch)
     labels = scene.segmentation()[0].cpu().numpy().astype(np.int64)
     background = _background(scene, labels)
-    name = model.name
+    kind = "segmentation"
     if not model.predictor.model.tracks:
-        labels, name = link_frames(labels.clip(min=0), background), f"{name} (linked)"
+        labels, kind = link_frames(labels.clip(min=0), background), "segmentation, linked"
     picture: Any = scene.reconstruction[0].float().cpu().permute(0, 2, 3, 1).numpy()
-    return Shown(name, labels, background, rgb8(picture))
+    return Shown(model.name, labels, background, rgb8(picture), kind)
 
 
 def _background(scene: Scene, labels: np.ndarray) -> np.ndarray:

@@ -36,12 +36,14 @@ class Shown:
         segmentation: identity of every pixel; negative where there is none.
         background: which of these pixels are background.
         reconstruction: RGB.
+        kind: of the segmentation, for its caption.
     """
 
     name: str
     segmentation: Int64[np.ndarray, "T H W"]
     background: Bool[np.ndarray, "T H W"]
     reconstruction: UInt8[np.ndarray, "T H W 3"]
+    kind: str = "segmentation"
 
 
 def comparison(
@@ -78,7 +80,7 @@ def comparison(
     if truth is not None:
         rows.append(("ground truth", "", _paint(np.where(truth == 0, BACKGROUND, truth))))
     for model, labels in zip(models, painted, strict=True):
-        rows.append((model.name, "segmentation", _paint(labels)))
+        rows.append((model.name, model.kind, _paint(labels)))
         rows.append(("", "reconstruction", model.reconstruction))
     save_png(path, _page(name, rows, spread(len(frames), columns)))
 
