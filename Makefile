@@ -12,10 +12,14 @@ INSTALLED := $(VENV)/.apex_lab_installed
 BASE_PYTHON ?= $(shell for name in python3.11 python3.12 python3.13; do \
 	$$name -c '' 2>/dev/null && echo $$name && exit; done; echo python3)
 
-.PHONY: quickstart install test test-all lint types contracts
+.PHONY: quickstart predict install test test-all lint types contracts
 
 quickstart: install
 	$(BIN)/python -m apex_lab.train scale=quickstart
+
+# The shipped weights on the shipped example; prints the folder with the overlay, masks, tracks and table.
+predict: install
+	$(BIN)/python -m apex_lab.predict checkpoint=apex-p2d-cpu video=examples/pushing.mp4
 
 install: $(INSTALLED)
 

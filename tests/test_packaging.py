@@ -25,6 +25,7 @@ def test_the_wheel_holds_code_and_configuration_and_no_tests(wheel: Path) -> Non
     for path in (REPOSITORY / "conf").rglob("*.yaml"):
         assert f"apex_lab/{path.relative_to(REPOSITORY)}" in names
     assert "apex_lab/conf/recipe/apex/paper.yaml" in names
+    assert {"apex_lab/weights/apex_p2d_cpu.ckpt", "apex_lab/py.typed"} <= names
     for folder in ("src/apex_lab", "src/hydra_plugins", "sims", "recordings"):
         for path in (REPOSITORY / folder).rglob("*.py"):
             assert str(path.relative_to(REPOSITORY)).removeprefix("src/") in names
@@ -57,4 +58,6 @@ def test_the_wheel_s_own_configuration_is_used_from_any_folder(wheel: Path, tmp_
     told = ask("-c", f"{where}; from apex_lab.train import main; main()", "scale=smoke", "--cfg", "job")
     assert told.splitlines()[0] == str(site / "apex_lab/conf")
     assert "max_steps: 6\n" in told
+    shipped = ask("-c", "from apex_lab.runs.shipped import weights; print(weights('apex-p2d-cpu'))")
+    assert shipped.strip() == str(site / "apex_lab/weights/apex_p2d_cpu.ckpt")
     assert list(elsewhere.iterdir()) == []

@@ -79,7 +79,7 @@ class Evaluation:
 
 def main() -> None:
     """Entry point: `python -m apex_lab.evaluate`."""
-    cli.launch(cli.Command("evaluate", check_evaluation, evaluate, title))
+    cli.launch(cli.Command("evaluate", check_evaluation, evaluate, title, any_data=True))
 
 
 def title(job: Evaluation) -> str:

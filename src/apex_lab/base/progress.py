@@ -17,12 +17,12 @@ class Meter:
 
     Args:
         title: the unit of work.
-        total: how many there are.
+        total: how many there are; None: not known.
         done: how many were done before.
         seconds: between two lines where there is no terminal.
     """
 
-    def __init__(self, title: str, total: int, done: int = 0, seconds: float = 15.0) -> None:
+    def __init__(self, title: str, total: int | None, done: int = 0, seconds: float = 15.0) -> None:
         self._title, self._total, self._seconds = title, total, seconds
         self._first, self._began = done, time.monotonic()
         self._told = self._began
@@ -57,9 +57,16 @@ class Meter:
             self._bar.update(self._task, completed=done, note=note)
         elif self.due():
             self._told = time.monotonic()
-            left = (self._told - self._began) / max(done - self._first, 1) * (self._total - done)
-            parts = [f"{self._title} {done} of {self._total}", *([note] if note else []), f"{readable(left)} left"]
-            console.say(", ".join(parts))
+            console.say(", ".join([*self._state(done), *([note] if note else []), *self._left(done)]))
+
+    def _state(self, done: int) -> list[str]:
+        return [f"{self._title} {done}" if self._total is None else f"{self._title} {done} of {self._total}"]
+
+    def _left(self, done: int) -> list[str]:
+        if self._total is None:
+            return []
+        left = (self._told - self._began) / max(done - self._first, 1) * (self._total - done)
+        return [f"{readable(max(left, 0))} left"]
 
 
 def readable(seconds: float) -> str:

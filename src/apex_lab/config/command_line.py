@@ -7,6 +7,7 @@ of four jobs' misspelt value is found before the first one starts, `++` included
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import sys
 import traceback
@@ -62,6 +63,11 @@ class Command:
         title: a job in a few words, for the list of what failed.
         known: the state of a job that was not started; None where jobs leave nothing behind that could be looked at.
         reseeded: the job of another seed of a checked configuration; None where seeds are checked like other jobs.
+        literal: keys whose values are names of files, so that their commas, brackets and equals signs mean nothing to
+            Hydra; lists in brackets and values in quotes are left to it.
+        any_data: words that set keys of `data` are passed on though no file has such keys, since a checkpoint brings
+            the data's settings; the check knows which exist.
+        model_groups: the command composes models, so short names of their groups (`masks=scalor`) are understood.
     """
 
     config_name: str
@@ -70,6 +76,9 @@ class Command:
     title: Callable[[Any], str]
     known: Callable[[Any], Known] | None = None
     reseeded: Callable[[Any, Composed], Any] | None = None
+    literal: tuple[str, ...] = ()
+    any_data: bool = False
+    model_groups: bool = True
 
 
 def launch(command: Command) -> None:
@@ -109,9 +118,10 @@ def launch(command: Command) -> None:
         ended.append((state, str(error)))
         return state
 
-    sys.argv[1:] = full_names(_options_last(sys.argv[1:]))
-    if command.config_name == "evaluate":
-        # the checkpoint brings the data's settings, so no file here has them; the check knows which exist
+    sys.argv[1:] = _options_last([_quoted(word, command.literal) for word in sys.argv[1:]])
+    if command.model_groups:
+        sys.argv[1:] = full_names(sys.argv[1:])
+    if command.any_data:
         sys.argv[1:] = [f"++{word}" if word.startswith("data.") else word for word in sys.argv[1:]]
     sweep = Sweep([], command.known)
     try:
@@ -240,6 +250,16 @@ def _checked(command: Command, name: str, extra: Sequence[str], jobs: Sequence[t
             job = command.reseeded(first[rest], made)
         items.append(Item(made.words, job, command.title(job)))
     return items
+
+
+def _quoted(word: str, literal: Sequence[str]) -> str:
+    """The word with its value in quotes, if its key is one of names of files and the value is not a list or quoted."""
+    key, equals, value = word.partition("=")
+    if key.lstrip("+") not in literal or not equals or value in ("", "null") or value[0] in "['\"":
+        return word
+    # in quotes a backslash stands for itself, unless it comes before a quote or the end
+    escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value)
+    return f"{key}={equals[1:]}'{escaped}'"
 
 
 def _options_last(arguments: Sequence[str]) -> list[str]:

@@ -182,7 +182,7 @@ def check_groups(command: str, overrides: Sequence[str]) -> None:
     """Refuses choices that a command does not have, and two of one thing in one run: Hydra would merge them into a run
     that no choice names.
     """
-    if command not in ("train", "bench", "evaluate"):
+    if command not in ("train", "bench", "evaluate", "compare"):
         return
     given: dict[str, str] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
@@ -190,7 +190,7 @@ def check_groups(command: str, overrides: Sequence[str]) -> None:
         if key not in CHOICES or override.is_delete() or override.is_sweep_override():
             continue
         word = override.get_value_element_as_str()
-        if command == "evaluate" and key != "data":
+        if command in ("evaluate", "compare") and key != "data":
             raise UserError(f"{key}={word} is for training: a checkpoint brings its own configuration; leave it out.")
         plus = "+" if override.is_add() else ""
         if isinstance(override.value(), list):

@@ -1,4 +1,4 @@
-"""Which checkpoint files are meant, and which of them cannot be evaluated: found out before any model is built."""
+"""Which checkpoint files cannot be evaluated: found out before any model is built."""
 
 from __future__ import annotations
 
@@ -14,38 +14,9 @@ from apex_lab.config import components
 from apex_lab.config import schema as config
 from apex_lab.evaluation.other_data import OtherData
 from apex_lab.runs import checkpoints
+from apex_lab.runs.checkpoint_files import Bad, find
 
-Bad = dict[Path, str]
-"""What cannot be evaluated -> why, in one sentence."""
-
-
-def find(patterns: Sequence[str]) -> tuple[list[Path], Bad]:
-    """The checkpoint files that are meant, each once, in the order of the patterns; and what holds none.
-
-    Files that a folder or a pattern names are in natural order: seed_2 before seed_10.
-
-    Args:
-        patterns: checkpoint files, run folders (their last checkpoint), folders that hold run folders, or patterns
-            with `*` for any of these.
-
-    Raises:
-        UserError: one of them means no checkpoint; of several things that fit a pattern, some may be without.
-    """
-    found: dict[Path, Path] = {}
-    bad: Bad = {}
-    for pattern in patterns:
-        matches = _matches(pattern)
-        without: Bad = {}
-        for path in matches:
-            try:
-                for file in _files(path):
-                    found.setdefault(file.resolve(), file)
-            except UserError as error:
-                without[path] = str(error)
-        if len(without) == len(matches):
-            raise UserError(next(iter(without.values())))
-        bad |= without
-    return list(found.values()), bad
+__all__ = ["Bad", "find", "here", "listed", "look", "of_another_version"]
 
 
 def look(
@@ -127,35 +98,3 @@ def _checked(file: Path, stored: Mapping[str, Any]) -> None:
         validate(config.Config, stored, "")
     except UserError as error:
         raise of_another_version(file, error) from error
-
-
-def _matches(pattern: str) -> list[Path]:
-    path = Path(pattern)
-    if path.exists():
-        return [path]
-    if not any(mark in pattern for mark in "*?"):
-        raise UserError(f"checkpoint = {pattern} does not exist: give a .ckpt file or a run folder.")
-    start = Path(path.anchor) if path.is_absolute() else Path()
-    found = sorted(start.glob(str(path.relative_to(path.anchor))), key=natural_path_key)
-    if not found:
-        raise UserError(f"checkpoint = {pattern} fits nothing: give .ckpt files or run folders.")
-    return found
-
-
-def _files(path: Path) -> list[Path]:
-    """The file itself; the last checkpoint of a run; those of all runs in a folder."""
-    if not path.is_dir():
-        return [path]
-    own = path / "checkpoints" / "last.ckpt"
-    if own.is_file():
-        return [own]
-    # a pattern without * would pass over a link that leads nowhere
-    inside = [
-        file for file in path.rglob("last.ckpt*") if file.name == own.name and file.parent.name == own.parent.name
-    ]
-    if not inside:
-        raise UserError(
-            f"checkpoint = {path} is a folder without checkpoints/last.ckpt, and no run folder is in it: "
-            "give a .ckpt file or a run folder."
-        )
-    return sorted(inside, key=natural_path_key)

@@ -23,7 +23,7 @@ def fitted(video: Float[Tensor, "B T 3 H W"], size: Size | None) -> Float[Tensor
     """The video at a model's input size, antialiased; as it is where the sizes agree or any size will do."""
     if size is None or tuple(video.shape[-2:]) == tuple(size):
         return video
-    return _resized(video, size)
+    return resized_images(video, size)
 
 
 def fitted_back(scene: Scene, size: Size) -> Scene:
@@ -33,12 +33,13 @@ def fitted_back(scene: Scene, size: Size) -> Scene:
     return dataclasses.replace(
         scene,
         masks=resize_masks(scene.masks, size),
-        reconstruction=_resized(scene.reconstruction, size),
-        means=None if scene.means is None else _resized(scene.means, size),
+        reconstruction=resized_images(scene.reconstruction, size),
+        means=None if scene.means is None else resized_images(scene.means, size),
     )
 
 
-def _resized(images: Float[Tensor, "*batch 3 H W"], size: Size) -> Float[Tensor, "*batch 3 H2 W2"]:
+def resized_images(images: Float[Tensor, "*batch 3 H W"], size: Size) -> Float[Tensor, "*batch 3 H2 W2"]:
+    """Images in [0, 1] in another size: bilinear, antialiased."""
     flat = images.float().reshape(-1, *images.shape[-3:])
     found = F.interpolate(flat, size=size, mode="bilinear", align_corners=False, antialias=True)
     return found.clamp(0, 1).reshape(*images.shape[:-2], *size)

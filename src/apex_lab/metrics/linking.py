@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import torch
 from jaxtyping import Bool, Int64, Integer
@@ -13,52 +11,87 @@ from torch import Tensor
 from apex_lab.metrics.contingency import PAD, compact
 
 
-def link_frames(
-    prediction: Integer[np.ndarray, "T H W"], ignored: Bool[np.ndarray, "T H W"] | None = None
-) -> Int64[np.ndarray, "T H W"]:
-    """Links the segments of consecutive frames by Hungarian matching of their masks (metrics.md section 2.4).
+class Linker:
+    """Links the segments of frame after frame by Hungarian matching of their masks (metrics.md section 2.4).
 
     A segment takes over the identity of the segment of the frame before that it is matched with (largest total IoU,
     more than no overlap); all others get a number that was never used before. What the segments were called before
     does not matter.
 
+    Attributes:
+        last: linked identities of the last frame, and the pixels that belonged to no segment of it; None before the
+            first frame.
+        used: numbers that have been given, 0 to `used` - 1.
+    """
+
+    def __init__(self) -> None:
+        self.last: tuple[Int64[np.ndarray, "H W"], Bool[np.ndarray, "H W"]] | None = None
+        self.used = 0
+
+    def __call__(
+        self, frame: Integer[np.ndarray, "H W"], ignored: Bool[np.ndarray, "H W"] | None = None
+    ) -> Int64[np.ndarray, "H W"]:
+        """Linked identities of the next frame.
+
+        Args:
+            frame: segments, >= 0.
+            ignored: pixels that belong to no segment; what stands there changes no link, and what is returned there
+                means nothing.
+        """
+        out = np.zeros(frame.shape, dtype=bool) if ignored is None else ignored
+        after, names = _segments(frame, out)
+        now = np.full(len(names), PAD)
+        if self.last is not None:
+            before, before_names = _segments(*self.last)
+            counts = _shared(before, after, _flat(self.last[1]), _flat(out))
+            area_before, area_after = counts.sum(axis=1, keepdims=True), counts.sum(axis=0, keepdims=True)
+            counts = counts[1:, 1:]
+            iou = counts / np.maximum(area_before[1:] + area_after[:, 1:] - counts, 1)
+            i, j = linear_sum_assignment(iou, maximize=True)
+            same = iou[i, j] > 0
+            now[j[same]] = before_names[i[same]]
+        new = np.flatnonzero(now == PAD)
+        now[new] = np.arange(self.used, self.used + len(new))
+        self.used += len(new)
+        linked = now[after.numpy()].reshape(frame.shape)
+        self.last = (linked, out)
+        return linked
+
+
+def link_frames(
+    prediction: Integer[np.ndarray, "T H W"], ignored: Bool[np.ndarray, "T H W"] | None = None
+) -> Int64[np.ndarray, "T H W"]:
+    """Links the segments of all frames of a video; see `Linker`.
+
     Args:
         prediction: segments, >= 0.
-        ignored: pixels that belong to no segment of their frame here; what stands there changes no link.
+        ignored: pixels that belong to no segment of their frame.
     """
-    frames = torch.from_numpy(np.ascontiguousarray(prediction).astype(np.int64))
-    left_out = [None] * len(frames) if ignored is None else list(torch.from_numpy(ignored).reshape(len(frames), 1, -1))
-    # The segments of a frame are numbered 0, 1, ...; rows and columns of a table of two frames are these numbers.
-    segments = [compact(frame.reshape(1, -1), left_out=out)[0] for frame, out in zip(frames, left_out, strict=True)]
-    names = [np.arange(int(segments[0].max()) + 1)]
-    used = len(names[0])
-    for (before, out_before), (after, out_after) in pairwise(zip(segments, left_out, strict=True)):
-        counts = _shared(before, after, out_before, out_after)
-        area_before, area_after = counts.sum(axis=1, keepdims=True), counts.sum(axis=0, keepdims=True)
-        counts = counts[1:, 1:]
-        iou = counts / np.maximum(area_before[1:] + area_after[:, 1:] - counts, 1)
-        i, j = linear_sum_assignment(iou, maximize=True)
-        same = iou[i, j] > 0
-        now = np.full(iou.shape[1], PAD)
-        now[j[same]] = names[-1][i[same]]
-        new = np.flatnonzero(now == PAD)
-        now[new] = np.arange(used, used + len(new))
-        used += len(new)
-        names.append(now)
-    linked = [name[segment.numpy()] for name, segment in zip(names, segments, strict=True)]
-    return np.concatenate(linked).reshape(prediction.shape)
+    link = Linker()
+    return np.stack([link(frame, None if ignored is None else ignored[t]) for t, frame in enumerate(prediction)])
+
+
+def _segments(
+    frame: Integer[np.ndarray, "H W"], ignored: Bool[np.ndarray, "H W"]
+) -> tuple[Int64[Tensor, "1 N"], Int64[np.ndarray, " R"]]:
+    """The segments of a frame numbered 0, 1, ..., which are rows and columns of a table of two frames; their names."""
+    labels = torch.from_numpy(np.ascontiguousarray(frame).astype(np.int64)).reshape(1, -1)
+    numbered, names = compact(labels, left_out=_flat(ignored))
+    return numbered, names[0].numpy()
+
+
+def _flat(mask: Bool[np.ndarray, "H W"]) -> Bool[Tensor, "1 N"]:
+    return torch.from_numpy(np.ascontiguousarray(mask)).reshape(1, -1)
 
 
 def _shared(
     before: Int64[Tensor, "1 N"],
     after: Int64[Tensor, "1 N"],
-    out_before: Bool[Tensor, "1 N"] | None,
-    out_after: Bool[Tensor, "1 N"] | None,
+    out_before: Bool[Tensor, "1 N"],
+    out_after: Bool[Tensor, "1 N"],
 ) -> Int64[np.ndarray, "R C"]:
     """Pixels that the segments of two frames share; row and column 0 are the pixels that are left out."""
-    rows, columns = before + 1, after + 1
-    if out_before is not None and out_after is not None:
-        rows, columns = rows.masked_fill(out_before, 0), columns.masked_fill(out_after, 0)
+    rows, columns = (before + 1).masked_fill(out_before, 0), (after + 1).masked_fill(out_after, 0)
     shape = (int(before.max()) + 2, int(after.max()) + 2)
     cells = torch.bincount((rows * shape[1] + columns).flatten(), minlength=shape[0] * shape[1])
     return cells.view(shape).numpy()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
+
+Array = TypeVar("Array")
 
 Fit = Literal["crop", "letterbox"]
 """crop: the largest rectangle of the input's shape in the middle; letterbox: all of the frame, with black bars."""
@@ -55,9 +57,9 @@ class Framing:
         found[self.target.slices] = seen
         return found
 
-    def of_target(self, masks: Float[np.ndarray, "*batch h w"]) -> Float[np.ndarray, "*batch h2 w2"]:
-        """The part of masks at the input's size that shows the frame."""
-        return masks[(..., *self.target.slices)]
+    def of_target(self, images: Array) -> Array:
+        """The part of arrays or tensors (..., h, w) at the input's size that shows the frame."""
+        return images[(..., *self.target.slices)]  # type: ignore[index]
 
     def described(self) -> dict[str, Any]:
         """Plain values for a file, in pixels."""

@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -149,7 +150,7 @@ class _Clock:
         self._first: float | None = None
         self._last = 0.0
 
-    def time(self, capture: cv2.VideoCapture) -> float:
+    def time(self, capture: Any) -> float:
         """Seconds of the frame that was decoded last."""
         now = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
         if self._first is None:
@@ -237,7 +238,7 @@ class Camera(Video):
         return hashlib.sha256(self.name.encode()).hexdigest()[:32]
 
 
-def _next(capture: cv2.VideoCapture) -> UInt8[np.ndarray, "H W 3"] | None:
+def _next(capture: Any) -> UInt8[np.ndarray, "H W 3"] | None:
     """The next frame as RGB; None at the end, and where there is nothing to read."""
     found, image = capture.read()
     if not found or image is None or image.size == 0:

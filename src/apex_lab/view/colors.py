@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int, Integer, UInt8
 
 PALETTE = (
     "#56b4e9",
@@ -77,7 +77,7 @@ def overlay(
     return np.rint(alpha * paint + (1 - alpha) * picture).astype(np.uint8)
 
 
-def outline(segmentation: Int[np.ndarray, "H W"], width: int = 1) -> Bool[np.ndarray, "H W"]:
+def outline(segmentation: Integer[np.ndarray, "H W"], width: int = 1) -> Bool[np.ndarray, "H W"]:
     """Pixels less than `width` steps (up, down, left, right) away from one whose neighbour has another identity."""
     edge = np.zeros(segmentation.shape, dtype=bool)
     _spread(edge, segmentation[1:] != segmentation[:-1], segmentation[:, 1:] != segmentation[:, :-1])

@@ -9,14 +9,13 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import imageio_ffmpeg
 import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from apex_lab.base.errors import UserError
 from apex_lab.base.files import unwritable
 from apex_lab.view.canvas import FAINT, GAP, INK, MARGIN, cell_size, fit, font, picture_file, sheet
+from apex_lab.view.encoder import Mp4, ffmpeg
 from apex_lab.view.item import Clip, Item
 
 CELL = 160
@@ -92,7 +91,7 @@ def _frames(clips: Sequence[Clip]) -> Iterator[Image.Image]:
 
 @contextlib.contextmanager
 def mp4(path: Path, fps: float) -> Iterator[Callable[[Image.Image], None]]:
-    """A movie to add frames to, all of one even size; it is put in place of `path` at the end, if it is whole.
+    """A movie to add frames to, all of one size; it is put in place of `path` at the end, if it is whole.
 
     Args:
         path: what to write: H.264, yuv420p, playable in every browser.
@@ -101,79 +100,24 @@ def mp4(path: Path, fps: float) -> Iterator[Callable[[Image.Image], None]]:
     Raises:
         UserError: the file cannot be written, or this system has no ffmpeg.
     """
-    _need_ffmpeg(path)
+    ffmpeg()
     try:
         # ffmpeg needs a file name to write to
-        with tempfile.TemporaryDirectory() as folder:
+        with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as opened:
             part = Path(folder) / path.name
-            with _encoding(part, fps) as add:
-                yield add
-            with picture_file(path) as file, open(part, "rb") as made:
-                shutil.copyfileobj(made, file)
+            made: list[Mp4] = []
+
+            def add(frame: Image.Image) -> None:
+                if not made:
+                    made.append(opened.enter_context(Mp4(part, (frame.height, frame.width), fps)))
+                made[0].add(np.asarray(frame))
+
+            yield add
+            opened.close()
+            with picture_file(path) as file, open(part, "rb") as whole:
+                shutil.copyfileobj(whole, file)
     except OSError as error:
         raise unwritable(path, error) from error
-
-
-@contextlib.contextmanager
-def _encoding(path: Path, fps: float) -> Iterator[Callable[[Image.Image], None]]:
-    count = 0
-    encoder = None
-
-    def add(frame: Image.Image) -> None:
-        nonlocal count, encoder
-        if encoder is None:
-            encoder = _encoder(path, frame.size, fps)
-        encoder.send(np.asarray(frame).tobytes())
-        count += 1
-
-    try:
-        yield add
-    finally:
-        if encoder is not None:
-            encoder.close()
-    # ffmpeg may fail at its last write, when nobody listens any more
-    if (written := _count(path)) != count:
-        raise OSError(f"ffmpeg wrote {written} of {count} frames")
-
-
-def _count(path: Path) -> int:
-    """Frames of a movie; 0 if it cannot be read."""
-    if not path.exists():
-        return 0
-    try:
-        return imageio_ffmpeg.count_frames_and_secs(str(path))[0]
-    except RuntimeError:  # what imageio_ffmpeg raises for a file that ffmpeg cannot open
-        return 0
-
-
-def _need_ffmpeg(path: Path) -> None:
-    try:
-        program = imageio_ffmpeg.get_ffmpeg_exe()
-    except RuntimeError:
-        program = "ffmpeg"
-    if shutil.which(program) is None:
-        raise UserError(
-            f"{path.name} cannot be made, {program} is no program: "
-            "install ffmpeg and set the variable IMAGEIO_FFMPEG_EXE to where it is"
-        )
-
-
-def _encoder(path: Path, size: tuple[int, int], fps: float):  # type: ignore[no-untyped-def]  # imageio_ffmpeg has no types
-    """A started ffmpeg that takes RGB frames."""
-    encoder = imageio_ffmpeg.write_frames(
-        str(path),
-        size,
-        fps=fps,
-        codec="libx264",
-        pix_fmt_out="yuv420p",
-        quality=None,
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-        # near-lossless, so that thin outlines survive; the index in front, so that browsers start at once
-        output_params=["-crf", "16", "-preset", "slow", "-movflags", "+faststart", "-threads", "1"],
-    )
-    encoder.send(None)
-    return encoder
 
 
 def _write_gif(path: Path, clips: Sequence[Clip], fps: float) -> None:
