@@ -94,7 +94,7 @@ def test_an_interrupted_extraction_keeps_whole_episodes(tmp_path: Path, monkeypa
     [
         (member("../outside"), "leads outside"),
         (member(f"../{episode_name(7)}"), "leads outside"),
-        (member("/tmp/outside"), "leads outside"),
+        (member("/outside"), "leads outside"),
         (member("a/../../outside"), "leads outside"),
         (member(episode_name(7), tarfile.SYMTYPE, "/etc/passwd"), "no plain file"),
         (member(episode_name(7), tarfile.SYMTYPE, episode_name(1)), "no plain file"),

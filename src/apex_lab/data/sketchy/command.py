@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     request = Request(options.folder, options.root, options.name, options.image_size, options.windows, options.workers)
     try:
         with interruptible():
-            _repair(request) if options.repair else _prepare(request)
+            (_repair if options.repair else _prepare)(request)
     except UserError as error:
         console.error(str(error))
         sys.exit(1)
