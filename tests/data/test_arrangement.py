@@ -17,8 +17,8 @@ from apex_lab.inference.sizes import fitted
 from sims.arrangement.scenario import draw
 from sims.arrangement_clips.clip import SPLITS, sample, shrunk, shrunk_labels
 from sims.arrangement_clips.settings import Settings
-from sims.poses import moved
 from sims.assets import object_models
+from sims.poses import moved
 
 
 def test_objects_slide_apart_from_each_other_inside_the_workspace() -> None:
