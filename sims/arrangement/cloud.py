@@ -20,6 +20,8 @@ TALL_M = 0.4
 """Points higher than this belong to no object."""
 LINK_M = 0.025
 """Points nearer than this belong to the same body."""
+GRAIN_M = 0.003
+"""Denser points, of large images, are thinned to one per cube of this side."""
 NEIGHBOURS, DEVIATIONS = 8, 2.5
 """Statistical outlier removal: a point is dropped if the mean distance to its neighbours exceeds the mean of all by
 this many standard deviations."""
@@ -107,6 +109,9 @@ def _above(points: np.ndarray) -> np.ndarray:
 
 def _bodies(points: np.ndarray, view: View) -> list[Body]:
     """Bodies of connected points."""
+    if len(points) and pixel_m(view.camera, view.depth.shape[0], points) < GRAIN_M:
+        _, first = np.unique(np.floor(points / GRAIN_M).astype(int), axis=0, return_index=True)
+        points = points[np.sort(first)]
     points = without_outliers(points)
     if len(points) < MIN_POINTS:
         return []

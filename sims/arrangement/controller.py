@@ -73,7 +73,6 @@ class GoalState:
     done: bool = False
     visits: int = 0
     asides: int = 0
-    no_path: bool = False
 
 
 class Controller:
@@ -171,24 +170,36 @@ class Controller:
         if retry is not None:
             return retry
         picking = {goal: self._picking(scene, item.body) for goal, item in self._open(scene)}
-        for goal in sorted(picking, key=lambda goal: self._in_the_way(goal, picking)):
+        shut = {goal: self._shut(goal, picking) for goal in picking}
+        chosen = self._home(picking, [goal for goal in picking if not shut[goal]])
+        return (
+            chosen or self._aside(scene, picking, shut) or self._home(picking, [goal for goal in picking if shut[goal]])
+        )
+
+    def _home(self, picking: dict[int, Picking], goals: list[int]) -> tuple[Attempt, Plan] | None:
+        """The first of these goals whose target is free and can be reached; objects put aside come last."""
+        for goal in sorted(goals, key=lambda goal: self.states[goal].asides):
             body, target, state = picking[goal].body, self.goal.items[goal].body, self.states[goal]
-            state.no_path = False
             if state.visits < VISITS and _is_free(body, target, picking[goal].others):
                 path = picking[goal].to(target)
-                state.no_path = path is None
                 if path is not None:
                     state.visits += 1
                     return Attempt(goal, "home", body, target), path
-        return self._aside(scene, picking)
+        return None
 
     def _picking(self, scene: Scene, body: Body) -> Picking:
         return Picking(self.planner, body, scene.others(body))
 
-    def _in_the_way(self, goal: int, picking: dict[int, Picking]) -> int:
-        """How many open objects the hand could not reach any more if this one were at its goal."""
-        target = self.goal.items[goal].body
-        return sum(not _room(each.body, [target]) for other, each in picking.items() if other != goal)
+    def _shut(self, goal: int, picking: dict[int, Picking]) -> set[int]:
+        """Goals whose objects the hand could not take any more if this goal's object were there."""
+        body, target = picking[goal].body, self.goal.items[goal].body
+        found = set()
+        for other, each in picking.items():
+            if other != goal and not _room(each.body, [target]) and each.possible:
+                then = [one for one in each.others if one is not body] + [target]
+                if not Picking(self.planner, each.body, then).possible:
+                    found.add(other)
+        return found
 
     def _retry(self, scene: Scene) -> tuple[Attempt, Plan] | None:
         """The current sub-task again; closes it if it is done, was tried often enough or cannot be planned."""
@@ -209,14 +220,16 @@ class Controller:
         """Goals that are not reached, with their objects."""
         return [(goal, scene.items[item]) for item, goal in self.matches if not self.states[goal].done]
 
-    def _aside(self, scene: Scene, picking: dict[int, Picking]) -> tuple[Attempt, Plan] | None:
-        """Make room: a body that stands on the open goal of another or blocks the way, else any unsorted object, goes
-        to the edge."""
+    def _aside(
+        self, scene: Scene, picking: dict[int, Picking], shut: dict[int, set[int]]
+    ) -> tuple[Attempt, Plan] | None:
+        """Make room: a body that stands on the open goal of another, blocks the way, or would be shut in, goes to the
+        edge; else any unsorted object."""
         targets = {goal: self.goal.items[goal].body for goal in picking}
         owner = dict(self.matches)
         bodies = [(owner.get(number), item.body) for number, item in enumerate(scene.items)]
         bodies += [(None, body) for body in scene.strangers]
-        ranks = [self._blocks(goal, body, picking) for goal, body in bodies]
+        ranks = [self._blocks(goal, body, picking, shut) for goal, body in bodies]
         for rank, goal, body in sorted(
             ((rank, goal, body) for rank, (goal, body) in zip(ranks, bodies, strict=True)), key=lambda each: each[0]
         ):
@@ -224,7 +237,11 @@ class Controller:
                 continue
             if (self.moved_strangers if goal is None else self.states[goal].asides) >= ASIDES:
                 continue
-            found = self._to_edge(self._picking(scene, body), list(targets.values()))
+            found = self._to_edge(
+                self._picking(scene, body),
+                list(targets.values()),
+                [each.body for other, each in picking.items() if other != goal],
+            )
             if found is not None:
                 place, path = found
                 if goal is None:
@@ -235,7 +252,7 @@ class Controller:
                 return Attempt(goal, "aside", body, place), path
         return None
 
-    def _blocks(self, goal: int | None, body: Body, picking: dict[int, Picking]) -> int:
+    def _blocks(self, goal: int | None, body: Body, picking: dict[int, Picking], shut: dict[int, set[int]]) -> int:
         """How much a body is in the way of open objects: 0 if it alone stands on a target or keeps the hand away from
         one, 1 if others do so too, `IDLE` if it does not."""
         rank = IDLE
@@ -244,7 +261,7 @@ class Controller:
                 continue
             target = self.goal.items[other].body
             rest = [one for one in each.others if one is not body]
-            taken = not _is_free(each.body, target, [body])
+            taken = not _is_free(each.body, target, [body]) or goal in shut[other]
             if taken or not _room(each.body, [body]) or not _room(target, [body]):
                 rank = min(rank, 1)
                 alone = _is_free(each.body, target, rest)
@@ -252,8 +269,9 @@ class Controller:
                     return 0
         return rank
 
-    def _to_edge(self, picking: Picking, targets: list[Body]) -> tuple[Body, Plan] | None:
-        """The nearest free place at the edge that can be reached, away from other bodies and open goals."""
+    def _to_edge(self, picking: Picking, targets: list[Body], still: list[Body]) -> tuple[Body, Plan] | None:
+        """The nearest free place at the edge that can be reached, away from other bodies and from targets, and leaving
+        the hand room at the bodies that are still to be moved."""
         low, high = bounds(self.settings)
         xs, ys = (np.arange(a, b + 1e-9, GRID_M) for a, b in zip(low, high, strict=True))
         grid = np.array([(x, y) for x in xs for y in ys])
@@ -264,7 +282,8 @@ class Controller:
         for number in np.lexsort([far, inner]):
             place = replace(picking.body, centre=grid[number])
             apart = all(separate(place.outline, other.outline, APART_M) for other in around)
-            if not apart or not _room(place, around) or not self._visible(place):
+            room = apart and _room(place, around) and all(_room(body, [place]) for body in still)
+            if not room or not self._visible(place):
                 continue
             path = picking.to(place)
             if path is not None:

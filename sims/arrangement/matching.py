@@ -15,9 +15,15 @@ def match(current: list[np.ndarray], goal: list[np.ndarray]) -> list[tuple[int, 
 
     Returns:
         min(len(current), len(goal)) pairs, in the order of `current`.
+
+    Raises:
+        ValueError: the vectors have several lengths.
     """
     if not current or not goal:
         return []
+    lengths = {vector.shape for vector in (*current, *goal)}
+    if len(lengths) > 1:
+        raise ValueError(f"appearance vectors must have one shape, not {sorted(lengths)}")
     with np.errstate(over="ignore", invalid="ignore"):
         cost = cdist(np.stack(current).astype(np.float64), np.stack(goal).astype(np.float64))
     known = np.isfinite(cost)

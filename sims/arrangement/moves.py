@@ -63,6 +63,11 @@ class Picking:
                     return placed
         return None
 
+    @property
+    def possible(self) -> bool:
+        """Whether there is any way to pick it up."""
+        return next(self._picks(), None) is not None
+
     def _picks(self) -> Iterator[_Pick]:
         yield from self._found
         for pick in self._more:

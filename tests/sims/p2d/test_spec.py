@@ -93,3 +93,43 @@ def test_separate_polygons() -> None:
     assert separate(square, turned + np.array([0.02, 0.0]), 0.0)
     assert not separate(square, turned + np.array([0.02, 0.0]), 0.02)
     np.testing.assert_allclose(rectangle(np.array([1.0, 2.0]), (0.4, 0.2), np.pi / 2)[0], [0.9, 2.2])
+
+
+@pytest.mark.parametrize("count", [4, pytest.param(5, marks=pytest.mark.slow)])
+def test_crowded_tables_keep_the_rules(count: int) -> None:
+    """Drawn many at once, objects stand apart, whole in the picture, in slot order of their classes."""
+    crowded = Settings(min_objects=count, max_objects=count)
+    models = object_models(crowded.objects)
+    found = []
+    for index in range(10):
+        try:
+            found.append(sample(crowded, "train", index))
+        except NoRoom:
+            continue  # these classes find no room in this attempt; the next one draws again
+    assert len(found) >= 5
+    for spec in found:
+        assert len({p.class_index for p in spec.objects}) == count
+        clouds = []
+        for placement in spec.objects:
+            model = models[placement.class_index]
+            turning = Rotation.from_quat(placement.quaternion)
+            points = turning.apply(model.vertices) + placement.position
+            assert turning.apply(model.touching)[:, 2].min() + placement.position[2] == pytest.approx(0.0005, abs=1e-6)
+            pixels, _ = crowded.camera.project(points, 128)
+            assert pixels.min() >= 0
+            assert pixels.max() <= 128
+            clouds.append(points[:, :2])
+        for i, cloud in enumerate(clouds):
+            assert all(np.linalg.norm(cloud[:, None] - other, axis=-1).min() > 0.01 for other in clouds[:i])
+
+
+def test_places_of_up_to_three_objects_are_drawn_as_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The bytes of published data sets depend on it."""
+
+    def never(*_: object) -> None:
+        raise AssertionError("drawn many at once")
+
+    monkeypatch.setattr("sims.p2d.spec._place_crowded", never)
+    assert len(sample(Settings(min_objects=3), "train", 0).objects) == 3
+    with pytest.raises(AssertionError, match="many at once"):
+        sample(Settings(min_objects=4, max_objects=4), "train", 0)
