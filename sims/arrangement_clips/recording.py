@@ -27,7 +27,9 @@ FIELDS = {
     "rgb": Field("|u1", ("T", "S", "S", 3), "colour"),
     "segmentation": Field("|u1", ("T", "S", "S"), "0 background, 2 + i object i; the same number through the clip"),
     "classes": Field("<i2", ("O",), "index into facts.classes of each object; -1: there is none"),
-    "poses": Field("<f4", ("T", "O", 7), "x, y, z in metres and quaternion x, y, z, w of each object; 0: there is none"),
+    "poses": Field(
+        "<f4", ("T", "O", 7), "x, y, z in metres and quaternion x, y, z, w of each object; 0: there is none"
+    ),
 }
 
 

@@ -50,7 +50,13 @@ def scene(masks: list[list[float]], presence: list[float], ids: list[int]) -> Sc
 
 
 def test_what_is_absent_empty_or_background_is_no_detection() -> None:
-    masks = [[0.5, 0.1, 0.1, 0.1], [0.2, 0.5, 0.1, 0.2], [0.2, 0.3, 0.6, 0.3], [0.0, 0.0, 0.1, 0.1], [0.1, 0.1, 0.1, 0.3]]
+    masks = [
+        [0.5, 0.1, 0.1, 0.1],
+        [0.2, 0.5, 0.1, 0.2],
+        [0.2, 0.3, 0.6, 0.3],
+        [0.0, 0.0, 0.1, 0.1],
+        [0.1, 0.1, 0.1, 0.3],
+    ]
     # 2 wins a pixel and is absent: the pixel goes to the next best, 1 or 0; 3 is present and wins none; 4 holds nothing
     found = detections(scene(masks, [1.0, 0.9, 0.4, 1.0, 1.0], [0, 7, 8, 9, -1]), 0.5)
     assert [one.mask[0].tolist() for one in found] == [[False, True, False, True]]

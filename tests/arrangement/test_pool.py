@@ -65,4 +65,3 @@ def test_a_request_to_stop_ends_all_workers_at_once(tmp_path: Path) -> None:
     asking.join()
     assert time.monotonic() - began < 50
     assert not [child for child in psutil.Process().children() if "spawn_main" in " ".join(child.cmdline())]
-

@@ -55,7 +55,8 @@ def test_an_interval_is_refused() -> None:
 )
 def test_the_paper_s_sweeps(sweep: str, number: int) -> None:
     jobs = expand([f"+sweep={sweep}", "scale=smoke"])
-    assert len(jobs) == number  # paper: 6 models and 5 ablations x 4 seeds, 4 classical methods, 7 jobs of the arrangement task
+    # paper: 6 models and 5 ablations x 4 seeds, 4 classical methods, 7 jobs of the arrangement task
+    assert len(jobs) == number
     assert all(job[-1] == "scale=smoke" for job in jobs)
     assert len({(made.choices["model"], made.raw["seed"]) for made in composed("train", jobs[:4])}) == 4
 

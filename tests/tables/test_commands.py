@@ -30,10 +30,7 @@ def test_an_empty_folder_gives_every_command(tmp_path: Path) -> None:
             f"{train}{m} seed=0,1,2,3 scale=paper -m"
             for m in ("op3", "scalor", "gswm", "space", "slot_attention", "apex")
         ),
-        *(
-            f"{train}{model} seed=0 scale=paper"
-            for model in YARDSTICKS
-        ),
+        *(f"{train}{model} seed=0 scale=paper" for model in YARDSTICKS),
         *(
             f"{train}apex +ablation={ablation} seed=0,1,2,3 scale=paper -m"
             for ablation in ("image_stn", "no_entropy", "scalor_norm", "gaussian", "gaussian_scalor_norm")
@@ -115,6 +112,8 @@ def test_arranging_needs_one_seed_that_has_not_failed(tmp_path: Path) -> None:
     run_folder(tmp_path, "gswm", 1, foreground_share=0.3)
     tables, _ = made(tmp_path, tables=(4,))
     found = missing_runs(tables, None, ("gswm",))
-    assert [str(command) for command in found if command.remarks[0].startswith("G-SWM, ") and "arrange" in command.text] == [
+    assert [
+        str(command) for command in found if command.remarks[0].startswith("G-SWM, ") and "arrange" in command.text
+    ] == [
         f"python -m apex_lab.arrange checkpoint={tmp_path}/gswm_p2d_paper_0123abcd/seed_1  # G-SWM, data=p2d, table 4"
     ]
