@@ -100,6 +100,9 @@ def check_bench(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequ
     job = check_job({key: value for key, value in raw.items() if key != "bench"}, choices, overrides)
     if build_model(job.config).needs_labels:
         raise UserError(f"model={choices.get('model')} reads the ground truth: choose a model that looks at the video.")
+    for name in ("image_size", "frames"):
+        if not isinstance(job.config.data.get(name), int):
+            raise UserError(f"data.{name} is missing, and the size of the videos that are measured: give it a value.")
     if asked.output is not None and Path(asked.output).is_dir():
         raise UserError(f"bench.output = {shown(asked.output)} is a folder: name a file.")
     modes = _modes(asked, job)

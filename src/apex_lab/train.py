@@ -38,6 +38,7 @@ from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
 from apex_lab.training import estimate, ranks, worker
 from apex_lab.training.callbacks import Pruned
+from apex_lab.training.estimate import try_out
 from apex_lab.training.fit import fit
 from apex_lab.training.learner import Diverged
 from apex_lab.training.loggers import Curves, Wandb, closing
@@ -140,6 +141,8 @@ def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Cal
         run.restore(checkpoint["step"], checkpoint["training"])
     console.say(f"{title(run.job)} on {device.type}: {run.folder}")
     model = build_model(config)
+    if model.needs_training and checkpoint is None:
+        try_out(config, model)
     if model.needs_training and checkpoint is None and device.type == "cpu":
         warning = estimate.warning(config, model)
         if warning is not None:

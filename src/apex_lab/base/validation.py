@@ -13,6 +13,10 @@ from pydantic import BaseModel, ValidationError
 from apex_lab.base.errors import UserError
 
 
+LONGEST = 300
+"""Characters of a value that a sentence shows."""
+
+
 def one_line(error: BaseException | str) -> str:
     """The message of an exception, on one line and without a full stop."""
     text = " ".join(str(error).split()) or type(error).__name__
@@ -26,8 +30,9 @@ def sentence(text: str) -> str:
 
 
 def shown(value: object) -> str:
-    """A value as one would write it in a configuration."""
-    return json.dumps(value, ensure_ascii=False, default=str).replace('"', "'")
+    """A value as one would write it in a configuration; the middle of a long one is left out."""
+    text = json.dumps(value, ensure_ascii=False, default=str).replace('"', "'")
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -10,9 +11,10 @@ from typing import Any, Literal
 import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from apex_lab.base import faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
-from apex_lab.config import ablations, components
+from apex_lab.config import ablations, components, limits
 from apex_lab.config.components import is_node
 from apex_lab.config.composition import Composed, conf_dir
 from apex_lab.data.source import VideoSource
@@ -163,6 +165,7 @@ def check_job(
     raw = {key: value for key, value in raw.items() if key != "hydra"}
     if "sweep" in raw:
         raise UserError(f"+sweep={choices.get('sweep', '...')} lists several jobs: add -m to run them.")
+    limits.refuse_long_numbers(raw)
     groups = [folder.name for folder in conf_dir().iterdir() if folder.is_dir()]
     config = validate(Config, raw, "", also_known=groups)
     assert isinstance(config, Config)
@@ -174,7 +177,9 @@ def check_job(
     _check_components(config)
     if not to_train:
         return Job(config, raw, dict(choices), tuple(overrides))
-    _check_objective(config)
+    with limits.bounded():
+        _check_objective(config)
+    limits.refuse_large_batches(raw, _longest_clip(config))
     _check_splits(config)
     _check_cuda_graph(config.trainer)
     return Job(config, raw, dict(choices), tuple(overrides))
@@ -210,7 +215,7 @@ def build_model(config: Config) -> SceneModel:
     Raises:
         UserError: the constructor refuses its values, or it is no `SceneModel`.
     """
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), limits.bounded():
         torch.manual_seed(config.seed)
         model = components.build(config.model, "model")
     if not isinstance(model, SceneModel):
@@ -227,7 +232,8 @@ def build_optimizer(config: Config, parameters: Sequence[tuple[str, torch.nn.Par
     if config.optimizer is None:
         raise UserError("optimizer = null, but the model has weights to train: choose one, such as torch.optim.Adam.")
     optimizer = components.build(config.optimizer, "optimizer", params=parameters)
-    assert isinstance(optimizer, torch.optim.Optimizer)
+    if not isinstance(optimizer, torch.optim.Optimizer):
+        raise UserError(f"optimizer._target_ = {config.optimizer['_target_']!r} is not a torch.optim.Optimizer.")
     return optimizer
 
 
@@ -286,21 +292,35 @@ def _check_components(config: Config) -> None:
     if config.optimizer is not None:
         components.check(config.optimizer, "optimizer", supplied=["params"])
         rate = config.optimizer.get("lr")
-        if rate is not None and rate <= 0:
+        if isinstance(rate, int | float) and rate <= 0:
             raise UserError(f"optimizer.lr = {rate} is wrong: a learning rate is above 0.")
-    for name, node in config.schedule.items():
-        components.check(node, f"schedule.{name}")
-    numbers: dict[str, Any] = {f"loss.{name}": value for name, value in config.loss.items()}
+    numbers: dict[str, Any] = {f"schedule.{name}": node for name, node in config.schedule.items()}
+    numbers |= {f"loss.{name}": value for name, value in config.loss.items()}
     for key, value in {**numbers, "lr_scale": config.lr_scale, "clips.frames": config.clips.frames}.items():
         if isinstance(value, dict):
             if not is_node(value):
                 raise UserError(f"{key} = {shown(value)} is wrong: give a number or a schedule with a _target_.")
             components.check(value, key)
+            if not inspect.isclass(components.target_of(value, key)):
+                raise UserError(f"{key} is not a schedule: choose one of apex_lab.training.schedules.")
     for name, node in config.logger.items():
         components.check(node, f"logger.{name}", supplied=["run"])
+        _refuse_others(node, f"logger.{name}", "Logger")
     for name, node in config.callbacks.items():
         components.check(node, f"callbacks.{name}")
+        _refuse_others(node, f"callbacks.{name}", "Callback")
         _refuse_checkpoints(node, f"callbacks.{name}")
+
+
+def _refuse_others(node: Mapping[str, Any], key: str, kind: Literal["Logger", "Callback"]) -> None:
+    """A class of another kind would be found out by Lightning, in the middle of its work."""
+    classes = getattr(components.target_of(node, key), "__mro__", ())
+    # by name, since this module needs no Lightning
+    if not any(one.__name__ == kind and one.__module__.startswith(_LIGHTNING) for one in classes):
+        raise UserError(f"{key}._target_ = {shown(node['_target_'])} is no {kind} of Lightning: name a class that is.")
+
+
+_LIGHTNING = ("lightning.", "pytorch_lightning.")
 
 
 def _refuse_checkpoints(node: Mapping[str, Any], key: str) -> None:
@@ -332,17 +352,55 @@ def _check_objective(config: Config) -> None:
     ranges = dict.fromkeys(values, (0.0, math.inf)) | dict.fromkeys(
         (f"schedule.{name}" for name in schedules), (-math.inf, math.inf)
     )
-    ranges |= {f"schedule.{name}": limits for name, limits in model.schedule_ranges.items()}
+    ranges["lr_scale"] = (0.0, RATE)
+    ranges |= {f"schedule.{name}": within for name, within in model.schedule_ranges.items()}
     for key, value in values.items():
         _check_range(key, value, ranges[key], config.trainer.max_steps)
     _same_names("schedule", schedules, model.schedule_ranges)
     _same_names("loss", weights, model.term_names)
     if model.needs_training:
         _check_early_stopping(config, model)
-        build_optimizer(config, [(name, p) for name, p in model.named_parameters() if p.requires_grad])
+        _check_update(config, model)
         _check_monitor("trainer.monitor", config.trainer.monitor, model)
         _check_clips(config)
         _check_ranks(config, model)
+
+
+RATE = 1e9
+"""Learning rates lie below it; so their product with `lr_scale` is a number in single precision."""
+
+
+def _check_update(config: Config, model: SceneModel) -> None:
+    """Builds the optimiser, and makes an update of weights of the same names with one element each.
+
+    An optimiser may refuse only then what it was built with: dense gradients, or a step without a closure.
+    """
+    named = [(name, p) for name, p in model.named_parameters() if p.requires_grad]
+    for group in build_optimizer(config, named).param_groups:
+        if not 0 <= float(group["lr"]) <= RATE:
+            raise UserError(f"optimizer: a learning rate of {float(group['lr']):g} is wrong: it is at most {RATE:g}.")
+    small = [(name, torch.nn.Parameter(torch.zeros([1] * p.ndim))) for name, p in named]
+    for _, weight in small:
+        weight.grad = torch.zeros_like(weight)
+    optimizer = build_optimizer(config, small)
+    try:
+        optimizer.step()
+    except Exception as error:
+        assert config.optimizer is not None
+        told = faults.told(error, f"optimizer ({config.optimizer['_target_']}) cannot update this model's weights")
+        raise UserError(told) from error
+
+
+def _longest_clip(config: Config) -> int | None:
+    """Frames of the longest training clip; None: whole videos."""
+    frames = build_clip_frames(config)
+    lengths = [frames(step) for step in _looked_at(config.trainer.max_steps)]
+    return None if None in lengths else max(length for length in lengths if length is not None)
+
+
+def _looked_at(last: int) -> list[int]:
+    """Steps at which schedules are looked at: some 1,000, the first and the last among them."""
+    return [*range(0, last, max(1, last // 1000)), last]
 
 
 def _check_ranks(config: Config, model: SceneModel) -> None:
@@ -371,7 +429,9 @@ def _check_ranks(config: Config, model: SceneModel) -> None:
 def _check_clips(config: Config) -> None:
     """Clips of at least a frame, and not longer than videos."""
     frames, longest = build_clip_frames(config), config.data.get("frames")
-    for step in range(config.trainer.max_steps) if isinstance(config.clips.frames, dict) else (0,):
+    last = config.trainer.max_steps
+    every = range(last) if last <= 100_000 else _looked_at(last - 1)
+    for step in every if isinstance(config.clips.frames, dict) else (0,):
         wanted = frames(step)
         if wanted is None:
             continue
@@ -381,19 +441,25 @@ def _check_clips(config: Config) -> None:
             raise UserError(f"clips.frames is {wanted} at step {step}, but videos have data.frames = {longest} frames.")
 
 
-def _check_range(key: str, schedule: Callable[[int], float], limits: tuple[float, float], last: int) -> None:
+def _check_range(key: str, schedule: Callable[[int], float], within: tuple[float, float], last: int) -> None:
     """A schedule must stay within its limits at every step that a run makes; looked at in at most some 1,000 steps."""
-    low, high = limits
-    for step in [*range(0, last, max(1, last // 1000)), last]:
+    low, high = (min(max(limit, -_FLOAT), _FLOAT) for limit in within)
+    for step in _looked_at(last):
         try:
             value = float(schedule(step))
-        except (TypeError, ValueError, AttributeError) as error:
+        except Exception as error:
+            told = (
+                one_line(error) if isinstance(error, TypeError | ValueError | AttributeError) else faults.cited(error)
+            )
             raise UserError(
-                sentence(f"{key} is not a schedule, which gives a number for a step: {one_line(error)}")
+                sentence(f"{key} is not a schedule, which gives a finite number for a step: {told}")
             ) from error
         if not low <= value <= high:
-            reach = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
+            reach = f"at least {low:g}" if value < low and high == _FLOAT else f"between {low:g} and {high:g}"
             raise UserError(f"{key} is {value:g} at step {step}: it must be {reach}.")
+
+
+_FLOAT = torch.finfo(torch.float32).max
 
 
 def _check_monitor(key: str, monitor: object, model: SceneModel) -> None:
