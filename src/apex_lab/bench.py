@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json
-from apex_lab.base.validation import shown, validate
+from apex_lab.base.validation import PathText, shown, validate
 from apex_lab.benchmark import printed as report
 from apex_lab.benchmark.child import in_child
 from apex_lab.benchmark.compare import Comparison, compare, twins_of
@@ -47,7 +47,7 @@ class BenchPart(BaseModel):
     cpu_compiled_frames: int | None = Field(ge=1)
     memory: bool
     compare: bool
-    output: str | None = Field(min_length=1)
+    output: PathText | None
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from apex_lab.inference.predictor import Predictor
 from apex_lab.inference.sizes import fitted
 from apex_lab.runs import checkpoints
 from apex_lab.runs.folder import Outcome, Run, group_name, run_folder
-from apex_lab.runs.state import RunState, beating, read_state
+from apex_lab.runs.state import RunState, beating, is_whole, read_state
 from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
 from apex_lab.training import estimate, ranks, worker
@@ -231,7 +231,8 @@ def _evaluate(
 def _show(run: Run) -> None:
     """Prints the rows of scores and the paths of drawings."""
     for split, scored in read_json(run.metrics_file)["splits"].items():
-        console.say(evaluation.summary(split, scored["total"]))
+        if is_whole(scored):
+            console.say(evaluation.summary(split, scored["total"]))
     pictures = [path for path in run.view_folder.glob("*") if path.is_file()]
     for path in sorted(pictures, key=lambda path: (path.stem != "film_strip", path.name)):
         console.say(str(path))

@@ -1,4 +1,4 @@
-"""What nobody foresaw: any exception becomes one sentence, and its traceback goes into a file that the sentence names."""
+"""What nobody foresaw: any exception becomes one sentence, which names the file with its traceback."""
 
 from __future__ import annotations
 

@@ -73,8 +73,8 @@ def read_json(path: Path) -> dict[str, Any]:
         UserError: it is missing or damaged.
     """
     try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} cannot be read ({error}): remove it and run the same command again.") from error
     if not isinstance(content, dict):
         raise UserError(f"{path} holds no JSON object: remove it and run the same command again.")

@@ -38,9 +38,7 @@ def _groups(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cg
                 inner = root / folder / place.lstrip("/")
                 for group in (inner, *inner.parents):
                     if group.is_relative_to(root / folder):
-                        with contextlib.suppress(
-                            OSError, ValueError
-                        ):  # no limit ("max"), or not visible in a container
+                        with contextlib.suppress(OSError, ValueError):  # no limit ("max"), or out of sight
                             yield int((group / limit).read_text()), _in_use(group, use)
 
 

@@ -3,18 +3,41 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import inspect
 import json
+import os
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, ValidationError
 
 from apex_lab.base.errors import UserError
 
-
 LONGEST = 300
 """Characters of a value that a sentence shows."""
+
+
+def _openable(path: str) -> str:
+    """A path that the system can look for; there need not be anything.
+
+    Raises:
+        ValueError: empty, too long, or with characters that no path has.
+    """
+    if not path.strip():
+        raise ValueError("it is empty, as an unset variable is: give a path")
+    try:
+        os.lstat(path)
+    except OSError as error:
+        if error.errno in (errno.ENAMETOOLONG, errno.EINVAL):
+            raise ValueError(f"no path can be so ({error.strerror})") from error
+    except ValueError as error:
+        raise ValueError(f"no path can be so ({error})") from error
+    return path
+
+
+PathText = Annotated[str, AfterValidator(_openable)]
+"""A path in a configuration: not empty, and possible on this system."""
 
 
 def one_line(error: BaseException | str) -> str:

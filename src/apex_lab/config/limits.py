@@ -122,16 +122,13 @@ def refuse_large_batches(config: Mapping[str, Any], clip_frames: int | None) -> 
     data = config["data"]
     frames, side = (_count(data.get(name)) for name in ("frames", "image_size"))
     if frames is not None and side is not None:
-        pixels = 3 * side * side
+        pixels, sizes = 3 * side * side, ("frames", "image_size")
         clips = config["clips"]["batch_size"] * (clip_frames or frames)
-        _refuse(
-            4 * clips * pixels, f"a batch of {clips:,} frames", "clips.batch_size", config, ("frames", "image_size")
-        )
+        _refuse(4 * clips * pixels, f"a batch of {clips:,} frames", "clips.batch_size", config, sizes)
         asked = config["evaluation"]
         whole = asked["batch_size"] * frames  # videos are whole until they are cut into chunks; pixels are bytes then
         size = whole * pixels + 4 * asked["batch_size"] * min(frames, asked["chunk"] or frames) * pixels
-        named = "evaluation.batch_size"
-        _refuse(size, f"{whole:,} frames of whole videos", named, config, ("frames", "image_size"))
+        _refuse(size, f"{whole:,} frames of whole videos", "evaluation.batch_size", config, sizes)
     for split in ("train", "val", "test"):
         if (videos := _count(data.get(split))) is not None:
             _refuse(64 * videos, f"a list of {videos:,} videos", "", config, (split,))

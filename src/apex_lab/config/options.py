@@ -1,4 +1,4 @@
-"""The options of a command line and its words in one piece, before Hydra reads them; what is refused is one sentence."""
+"""The options and words of a command line before Hydra reads them; what is refused is one sentence."""
 
 from __future__ import annotations
 

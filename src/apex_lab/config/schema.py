@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -11,10 +12,10 @@ from typing import Any, Literal
 import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from apex_lab.base import faults
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
+from apex_lab.base.validation import PathText, did_you_mean, sentence, shown, validate
 from apex_lab.config import ablations, components, limits
+from apex_lab.config.checks import RATE, check_range, check_update, looked_at, refuse_checkpoints, refuse_others
 from apex_lab.config.components import is_node
 from apex_lab.config.composition import Composed, conf_dir
 from apex_lab.data.source import VideoSource
@@ -75,8 +76,8 @@ class EvaluationPart(_Part):
 class PathsPart(_Part):
     """Folders; relative ones are taken from where the command was started."""
 
-    outputs: str = Field(min_length=1)
-    data: str = Field(min_length=1)
+    outputs: PathText
+    data: PathText
 
 
 class Config(_Part):
@@ -174,7 +175,11 @@ def check_job(
         ablations.check(raw, choices, conf_dir())
     if needs_recipe and to_train:
         _check_recipe(config, choices)
-    _check_components(config)
+    try:
+        _check_components(config)
+    except UserError as error:
+        _explain_merged(str(error), overrides)
+        raise
     if not to_train:
         return Job(config, raw, dict(choices), tuple(overrides))
     with limits.bounded():
@@ -183,6 +188,22 @@ def check_job(
     _check_splits(config)
     _check_cuda_graph(config.trainer)
     return Job(config, raw, dict(choices), tuple(overrides))
+
+
+def _explain_merged(sentence: str, overrides: Sequence[str]) -> None:
+    """A dictionary on the command line is merged into the one in the files, so keys can be unknown that nobody typed.
+
+    Raises:
+        UserError: that is what has happened.
+    """
+    for word in overrides:
+        key, _, value = word.lstrip("+").partition("=")
+        unknown = re.match(rf"Unknown key {re.escape(key)}\.(\w+)", sentence)
+        if unknown and value.startswith("{") and unknown.group(1) not in value:
+            raise UserError(
+                f"{key}={{...}} is merged into what the files set there, {key}.{unknown.group(1)} among it: to replace "
+                f"all of it, write ~{key} '+{key}={{...}}'."
+            )
 
 
 def reseeded(job: Job, made: Composed) -> Job:
@@ -305,33 +326,11 @@ def _check_components(config: Config) -> None:
                 raise UserError(f"{key} is not a schedule: choose one of apex_lab.training.schedules.")
     for name, node in config.logger.items():
         components.check(node, f"logger.{name}", supplied=["run"])
-        _refuse_others(node, f"logger.{name}", "Logger")
+        refuse_others(node, f"logger.{name}", "Logger")
     for name, node in config.callbacks.items():
         components.check(node, f"callbacks.{name}")
-        _refuse_others(node, f"callbacks.{name}", "Callback")
-        _refuse_checkpoints(node, f"callbacks.{name}")
-
-
-def _refuse_others(node: Mapping[str, Any], key: str, kind: Literal["Logger", "Callback"]) -> None:
-    """A class of another kind would be found out by Lightning, in the middle of its work."""
-    classes = getattr(components.target_of(node, key), "__mro__", ())
-    # by name, since this module needs no Lightning
-    if not any(one.__name__ == kind and one.__module__.startswith(_LIGHTNING) for one in classes):
-        raise UserError(f"{key}._target_ = {shown(node['_target_'])} is no {kind} of Lightning: name a class that is.")
-
-
-_LIGHTNING = ("lightning.", "pytorch_lightning.")
-
-
-def _refuse_checkpoints(node: Mapping[str, Any], key: str) -> None:
-    """A second writer of checkpoints would meet the files that a run resumes from."""
-    classes = getattr(components.target_of(node, key), "__mro__", ())
-    # by name, since this module needs no Lightning
-    if any(one.__name__ == "Checkpoint" and one.__module__.endswith(".callbacks.checkpoint") for one in classes):
-        raise UserError(
-            f"{key}: a run keeps its checkpoints itself (trainer.checkpoint_interval, trainer.monitor): "
-            f"leave {node['_target_']} out."
-        )
+        refuse_others(node, f"callbacks.{name}", "Callback")
+        refuse_checkpoints(node, f"callbacks.{name}")
 
 
 def _check_objective(config: Config) -> None:
@@ -355,52 +354,23 @@ def _check_objective(config: Config) -> None:
     ranges["lr_scale"] = (0.0, RATE)
     ranges |= {f"schedule.{name}": within for name, within in model.schedule_ranges.items()}
     for key, value in values.items():
-        _check_range(key, value, ranges[key], config.trainer.max_steps)
+        check_range(key, value, ranges[key], config.trainer.max_steps)
     _same_names("schedule", schedules, model.schedule_ranges)
     _same_names("loss", weights, model.term_names)
     if model.needs_training:
         _check_early_stopping(config, model)
-        _check_update(config, model)
+        named = [(name, p) for name, p in model.named_parameters() if p.requires_grad]
+        check_update(lambda weights: build_optimizer(config, weights), named, (config.optimizer or {}).get("_target_"))
         _check_monitor("trainer.monitor", config.trainer.monitor, model)
         _check_clips(config)
         _check_ranks(config, model)
 
 
-RATE = 1e9
-"""Learning rates lie below it; so their product with `lr_scale` is a number in single precision."""
-
-
-def _check_update(config: Config, model: SceneModel) -> None:
-    """Builds the optimiser, and makes an update of weights of the same names with one element each.
-
-    An optimiser may refuse only then what it was built with: dense gradients, or a step without a closure.
-    """
-    named = [(name, p) for name, p in model.named_parameters() if p.requires_grad]
-    for group in build_optimizer(config, named).param_groups:
-        if not 0 <= float(group["lr"]) <= RATE:
-            raise UserError(f"optimizer: a learning rate of {float(group['lr']):g} is wrong: it is at most {RATE:g}.")
-    small = [(name, torch.nn.Parameter(torch.zeros([1] * p.ndim))) for name, p in named]
-    for _, weight in small:
-        weight.grad = torch.zeros_like(weight)
-    optimizer = build_optimizer(config, small)
-    try:
-        optimizer.step()
-    except Exception as error:
-        assert config.optimizer is not None
-        told = faults.told(error, f"optimizer ({config.optimizer['_target_']}) cannot update this model's weights")
-        raise UserError(told) from error
-
-
 def _longest_clip(config: Config) -> int | None:
     """Frames of the longest training clip; None: whole videos."""
     frames = build_clip_frames(config)
-    lengths = [frames(step) for step in _looked_at(config.trainer.max_steps)]
+    lengths = [frames(step) for step in looked_at(config.trainer.max_steps)]
     return None if None in lengths else max(length for length in lengths if length is not None)
-
-
-def _looked_at(last: int) -> list[int]:
-    """Steps at which schedules are looked at: some 1,000, the first and the last among them."""
-    return [*range(0, last, max(1, last // 1000)), last]
 
 
 def _check_ranks(config: Config, model: SceneModel) -> None:
@@ -430,7 +400,7 @@ def _check_clips(config: Config) -> None:
     """Clips of at least a frame, and not longer than videos."""
     frames, longest = build_clip_frames(config), config.data.get("frames")
     last = config.trainer.max_steps
-    every = range(last) if last <= 100_000 else _looked_at(last - 1)
+    every = range(last) if last <= 100_000 else looked_at(last - 1)
     for step in every if isinstance(config.clips.frames, dict) else (0,):
         wanted = frames(step)
         if wanted is None:
@@ -439,27 +409,6 @@ def _check_clips(config: Config) -> None:
             raise UserError(f"clips.frames is {wanted} at step {step}: a clip has at least one frame.")
         if isinstance(longest, int) and wanted > longest:
             raise UserError(f"clips.frames is {wanted} at step {step}, but videos have data.frames = {longest} frames.")
-
-
-def _check_range(key: str, schedule: Callable[[int], float], within: tuple[float, float], last: int) -> None:
-    """A schedule must stay within its limits at every step that a run makes; looked at in at most some 1,000 steps."""
-    low, high = (min(max(limit, -_FLOAT), _FLOAT) for limit in within)
-    for step in _looked_at(last):
-        try:
-            value = float(schedule(step))
-        except Exception as error:
-            told = (
-                one_line(error) if isinstance(error, TypeError | ValueError | AttributeError) else faults.cited(error)
-            )
-            raise UserError(
-                sentence(f"{key} is not a schedule, which gives a finite number for a step: {told}")
-            ) from error
-        if not low <= value <= high:
-            reach = f"at least {low:g}" if value < low and high == _FLOAT else f"between {low:g} and {high:g}"
-            raise UserError(f"{key} is {value:g} at step {step}: it must be {reach}.")
-
-
-_FLOAT = torch.finfo(torch.float32).max
 
 
 def _check_monitor(key: str, monitor: object, model: SceneModel) -> None:

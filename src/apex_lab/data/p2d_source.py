@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.validation import PathText
 from apex_lab.data.p2d import P2D
 from apex_lab.data.source import VideoSource
 from sims.errors import SimError
@@ -46,7 +47,7 @@ class P2DSource(VideoSource):
 
     def __init__(
         self,
-        root: str,
+        root: PathText,
         data_seed: Annotated[int, Field(ge=0)] = 0,
         train: Annotated[int, Field(gt=0)] = 2000,
         val: Annotated[int, Field(ge=0)] = 200,

@@ -17,6 +17,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.validation import sentence, shown, validate
 from apex_lab.metrics import KEYS
+from apex_lab.runs.record import read_record
 
 MIN_SHARE, MAX_SHARE = 0.001, 0.999
 """A seed has failed whose objects are given less or more of the validation pixels (metrics.md section 3)."""
@@ -152,7 +153,7 @@ def read_arrangement(run: SeedRun) -> dict[str, list[list[float]]] | None:
 def _record(file: Path, seed: int, known: Mapping[str, Any] | None) -> Record:
     if not known and not file.is_file():
         raise UserError(f"{file} is missing: run the command of this run again.")
-    content = known or read_json(file)
+    content = known or read_record(file)
     try:
         record = validate(Record, content, "")
     except UserError as error:
