@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,8 @@ def train(job: Job, callbacks: Sequence[L.Callback] = (), command: str | None = 
                 outcome = _train(run, device, began, callbacks)
             except BaseException as error:
                 stop = _stop(error)
-                run.fail(*_reason(stop or error))
+                with suppress(UserError, OSError):  # what went wrong is told, though it may not be recorded
+                    run.fail(*_reason(stop or error))
                 console.note(traceback.format_exc())
                 if stop is not None:
                     raise stop from error

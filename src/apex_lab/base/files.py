@@ -52,7 +52,8 @@ def replacing(path: Path, keep: Path | None = None) -> Iterator[IO[bytes]]:
     except OSError as error:
         raise unwritable(path, error) from error
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a file system without write access says so before it looks for the file
+            part.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -34,6 +34,7 @@ from apex_lab.config.job_list import expand
 from apex_lab.config.options import arrange, only_asks, options, passed_on
 from apex_lab.config.preflight import (
     Check,
+    asks_for_sweep,
     check_groups,
     check_hydra_keys,
     check_launcher,
@@ -215,7 +216,7 @@ def _preflight(command: Command) -> list[Item]:
     with composing(overrides, arguments.config_path):
         check_hydra_keys(name, extra, overrides)
         check_groups(command.config_name, overrides)
-        if not (arguments.multirun or "hydra.mode=MULTIRUN" in overrides):
+        if not (arguments.multirun or asks_for_sweep(name, extra, overrides)):
             _checked(command, name, extra, [tuple(overrides)])
             return []
         check_launcher(name, extra, overrides)

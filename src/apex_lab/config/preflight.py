@@ -87,6 +87,15 @@ def search_path(config_dir: str | None) -> list[str]:
     return [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"]
 
 
+def asks_for_sweep(name: str, extra: Sequence[str], overrides: Sequence[str]) -> bool:
+    """Whether `hydra.mode`, in a word or in the file of an experiment, asks for what `-m` asks for."""
+    keys = {o.key_or_group: o for o in OverridesParser.create().parse_overrides(list(overrides))}
+    if "hydra.mode" not in keys and "experiment" not in keys:
+        return False
+    config = compose(name, overrides=[*extra, *of_all_jobs(overrides)], return_hydra_config=True)
+    return getattr(config.hydra.mode, "name", None) == "MULTIRUN"
+
+
 def swept_by_files(name: str, extra: Sequence[str], overrides: Sequence[str]) -> list[str]:
     """What configuration files sweep by `hydra.sweeper.params`, as words of a command line."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))

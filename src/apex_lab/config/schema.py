@@ -178,12 +178,17 @@ def check_job(
     try:
         _check_components(config)
     except UserError as error:
+        ablations.explain(str(error), choices, conf_dir())
         _explain_merged(str(error), overrides)
         raise
     if not to_train:
         return Job(config, raw, dict(choices), tuple(overrides))
-    with limits.bounded():
-        _check_objective(config)
+    try:
+        with limits.bounded():
+            _check_objective(config)
+    except UserError as error:
+        ablations.explain(str(error), choices, conf_dir())
+        raise
     limits.refuse_large_batches(raw, _longest_clip(config))
     _check_splits(config)
     _check_cuda_graph(config.trainer)

@@ -27,7 +27,7 @@ from filelock import FileLock, Timeout
 
 from apex_lab.base import console
 from apex_lab.base.errors import Busy, UserError
-from apex_lab.base.files import drafts, make_folder, read_json, set_aside, write_json, write_text
+from apex_lab.base.files import drafts, make_folder, read_json, set_aside, unwritable, write_json, write_text
 from apex_lab.config.schema import Job
 from apex_lab.config.upgrades import FORMAT, fingerprint
 from apex_lab.runs import identity, provenance
@@ -142,7 +142,10 @@ class Run:
         make_folder(self.folder / "checkpoints")
         for place in (self.folder, *self._places()):
             for part in drafts(place):
-                part.unlink()  # left by a kill in the middle of writing
+                try:
+                    part.unlink()  # left by a kill in the middle of writing
+                except OSError as error:
+                    raise unwritable(part, error) from error
         self._lost = not self.record
         commit, dirty = provenance.commit()
         now, choices, config = _now(), self.job.choices, self.job.config
