@@ -15,6 +15,7 @@ import platformdirs
 from filelock import FileLock
 
 from sims.bullet import load_pybullet, pybullet_version
+from sims.errors import SimError
 
 FORMAT = 7
 """Version of the cached files: raise it when their content changes; files of other versions are ignored."""
@@ -55,23 +56,36 @@ def made_once(name: str, recipe: dict[str, object], make: Callable[[Path], None]
         name: readable prefix of the folder's name.
         recipe: JSON data that names everything the files depend on, besides `FORMAT` and `versions`.
         make: writes the files into the folder it is given.
+
+    Raises:
+        SimError: the cache cannot be written.
     """
     key = hashlib.sha256(json.dumps([FORMAT, versions(), recipe], sort_keys=True).encode()).hexdigest()[:16]
     folder = cache_folder() / "models" / f"{name}-{key}"
     if _intact(folder):
         return folder
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    with FileLock(f"{folder}.lock"):
-        if not _intact(folder):
-            shutil.rmtree(folder, ignore_errors=True)
-            unfinished = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=folder.parent))
-            try:
-                make(unfinished)
-                (unfinished / CHECKSUMS).write_text(json.dumps(_checksums(unfinished)), encoding="utf-8")
-                unfinished.rename(folder)
-            finally:
-                shutil.rmtree(unfinished, ignore_errors=True)
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with FileLock(f"{folder}.lock"):
+            if not _intact(folder):
+                shutil.rmtree(folder, ignore_errors=True)
+                _make(name, folder, make)
+    except OSError as error:
+        raise SimError(
+            f"the cache at {cache_folder()} cannot be written ({error.strerror or error}): set APEX_LAB_CACHE to a "
+            "folder that can be, with some megabytes to spare"
+        ) from error
     return folder
+
+
+def _make(name: str, folder: Path, make: Callable[[Path], None]) -> None:
+    unfinished = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=folder.parent))
+    try:
+        make(unfinished)
+        (unfinished / CHECKSUMS).write_text(json.dumps(_checksums(unfinished)), encoding="utf-8")
+        unfinished.rename(folder)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def _intact(folder: Path) -> bool:

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json
-from apex_lab.base.validation import shown, validate
+from apex_lab.base.validation import PathText, shown, validate
 from apex_lab.benchmark import printed as report
 from apex_lab.benchmark.child import in_child
 from apex_lab.benchmark.compare import Comparison, compare, twins_of
@@ -47,7 +47,7 @@ class BenchPart(BaseModel):
     cpu_compiled_frames: int | None = Field(ge=1)
     memory: bool
     compare: bool
-    output: str | None = Field(min_length=1)
+    output: PathText | None
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,9 @@ def check_bench(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequ
     job = check_job({key: value for key, value in raw.items() if key != "bench"}, choices, overrides)
     if build_model(job.config).needs_labels:
         raise UserError(f"model={choices.get('model')} reads the ground truth: choose a model that looks at the video.")
+    for name in ("image_size", "frames"):
+        if not isinstance(job.config.data.get(name), int):
+            raise UserError(f"data.{name} is missing, and the size of the videos that are measured: give it a value.")
     if asked.output is not None and Path(asked.output).is_dir():
         raise UserError(f"bench.output = {shown(asked.output)} is a folder: name a file.")
     modes = _modes(asked, job)

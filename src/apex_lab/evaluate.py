@@ -7,7 +7,6 @@ python -m apex_lab.evaluate predictions=other.npz
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,9 +14,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from apex_lab.base import console
+from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
+from apex_lab.base.validation import PathText, did_you_mean, sentence, shown, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import schema as config
 from apex_lab.evaluation import OF_SCENES, Export, ScoringPart
@@ -25,6 +24,7 @@ from apex_lab.evaluation.checkpoint import Request, evaluate_checkpoint, load, r
 from apex_lab.evaluation.files import Bad, find, listed, look
 from apex_lab.evaluation.other_data import OtherData
 from apex_lab.evaluation.others import Predictions, check_output, output_of, score_others
+from apex_lab.formats.bounds import GIGABYTES
 from apex_lab.metrics import KEYS
 
 
@@ -34,21 +34,22 @@ class EvaluateConfig(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     split: Literal["train", "val", "test"]
-    checkpoint: str | list[str] | None
+    checkpoint: PathText | list[PathText] | None
     videos: int | None = Field(ge=1)
     pictures: int = Field(ge=0)
     pictures_by: str
     export: Export | None
     accelerator: Literal["auto", "cpu", "gpu"]
-    folder: str | None = Field(min_length=1)
+    folder: PathText | None
     save_interval: int = Field(ge=1)
     again: bool
-    predictions: str | None = Field(min_length=1)
+    predictions: PathText | None
     format: Literal["npz", "coco", "weis", "davis", "mots"] | None
-    truth: str | None = Field(min_length=1)
+    truth: PathText | None
     partial: bool
     resize: Literal["masks", "truth"] | None
-    output: str | None = Field(min_length=1)
+    output: PathText | None
+    max_gigabytes: float = Field(default=GIGABYTES, gt=0)
     batch_size: int = Field(default=4, ge=1)
     chunk: int | None = Field(default=None, ge=1)
     data: dict[str, Any] = Field(default_factory=dict)
@@ -62,7 +63,10 @@ OF_CHECKPOINTS: dict[str, Any] = {
     **{"videos": None, "export": None, "folder": None, "again": False},
     **{"data": {}, "chunk": None, "trust": False},
 }
-OF_PREDICTIONS = {"format": None, "truth": None, "partial": False, "resize": None, "output": None}
+OF_PREDICTIONS: dict[str, Any] = {
+    **{"format": None, "truth": None, "partial": False, "resize": None, "output": None},
+    **{"max_gigabytes": GIGABYTES},
+}
 """Keys of one kind of evaluation alone, with their defaults."""
 
 
@@ -151,8 +155,8 @@ def evaluate(job: Evaluation) -> None:
             console.error(str(error))
             failed[file] = str(error)
         except Exception as error:  # noqa: BLE001 - reported here and below; the others must still be evaluated
-            traceback.print_exc()
-            failed[file] = sentence(f"{type(error).__name__}: {one_line(error)}")
+            failed[file] = faults.told(error)
+            console.error(failed[file])
     if failed:
         raise UserError(listed(failed, count))
 
@@ -210,6 +214,7 @@ def _predictions(asked: EvaluateConfig) -> Predictions:
         resize=asked.resize,
         output=output,
         scoring=scoring,
+        max_gigabytes=asked.max_gigabytes,
     )
 
 

@@ -20,6 +20,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from apex_lab.base import console as terminal
 from apex_lab.base.progress import readable
 from apex_lab.config.composition import outputs_folder
 from apex_lab.config.reader import Reader, ending
@@ -55,7 +56,7 @@ def main() -> None:
         asked = reader.asked()
         look = looking(asked.words, asked.config_dir)
         if asked.json:
-            print(json.dumps(look().as_json(), indent=2))
+            terminal.say(json.dumps(look().as_json(), indent=2))
         elif asked.once or not sys.stdout.isatty():
             Console(file=sys.stdout).print(drawn(look()))
         else:

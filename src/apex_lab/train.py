@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -33,11 +34,12 @@ from apex_lab.inference.predictor import Predictor
 from apex_lab.inference.sizes import fitted
 from apex_lab.runs import checkpoints
 from apex_lab.runs.folder import Outcome, Run, group_name, run_folder
-from apex_lab.runs.state import RunState, beating, read_state
+from apex_lab.runs.state import RunState, beating, is_whole, read_state
 from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
 from apex_lab.training import estimate, ranks, worker
 from apex_lab.training.callbacks import Pruned
+from apex_lab.training.estimate import try_out
 from apex_lab.training.fit import fit
 from apex_lab.training.learner import Diverged
 from apex_lab.training.loggers import Curves, Wandb, closing
@@ -95,7 +97,8 @@ def train(job: Job, callbacks: Sequence[L.Callback] = (), command: str | None = 
                 outcome = _train(run, device, began, callbacks)
             except BaseException as error:
                 stop = _stop(error)
-                run.fail(*_reason(stop or error))
+                with suppress(UserError, OSError):  # what went wrong is told, though it may not be recorded
+                    run.fail(*_reason(stop or error))
                 console.note(traceback.format_exc())
                 if stop is not None:
                     raise stop from error
@@ -140,6 +143,8 @@ def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Cal
         run.restore(checkpoint["step"], checkpoint["training"])
     console.say(f"{title(run.job)} on {device.type}: {run.folder}")
     model = build_model(config)
+    if model.needs_training and checkpoint is None:
+        try_out(config, model)
     if model.needs_training and checkpoint is None and device.type == "cpu":
         warning = estimate.warning(config, model)
         if warning is not None:
@@ -228,7 +233,8 @@ def _evaluate(
 def _show(run: Run) -> None:
     """Prints the rows of scores and the paths of drawings."""
     for split, scored in read_json(run.metrics_file)["splits"].items():
-        console.say(evaluation.summary(split, scored["total"]))
+        if is_whole(scored):
+            console.say(evaluation.summary(split, scored["total"]))
     pictures = [path for path in run.view_folder.glob("*") if path.is_file()]
     for path in sorted(pictures, key=lambda path: (path.stem != "film_strip", path.name)):
         console.say(str(path))

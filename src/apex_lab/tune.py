@@ -14,7 +14,7 @@ from typing import Any
 
 import lightning as L
 
-from apex_lab.base import console
+from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.config import command_line as cli
 from apex_lab.config.schema import Job
@@ -28,9 +28,10 @@ def main() -> None:
     """Entry point: `python -m apex_lab.tune`."""
     console.setup()
     try:
-        if ranks.given() is not None:
-            raise UserError("Start this command by itself: each trial is a run in this process, not of torchrun.")
-        words, config_dir = cli.take_words(lambda key: not is_of_study(key))
+        with faults.net():
+            if ranks.given() is not None:
+                raise UserError("Start this command by itself: each trial is a run in this process, not of torchrun.")
+            words, config_dir = cli.take_words(lambda key: not is_of_study(key))
     except UserError as error:
         console.error(str(error))
         sys.exit(cli.CONFIG_ERROR)

@@ -1,13 +1,17 @@
-"""Messages to the person at the terminal and to a run's log.txt."""
+"""Messages to the person at the terminal and to a run's log.txt. What cannot be printed never stops any work."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO
+
+from apex_lab.base.files import unwritable
 
 _LOG = logging.getLogger("apex_lab")
 
@@ -17,12 +21,31 @@ class _ToStream(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         stream = sys.stderr if record.levelno >= logging.WARNING else sys.stdout
-        stream.write(self.format(record) + "\n")
-        stream.flush()
+        if stream is None:
+            return
+        text = self.format(record) + "\n"
+        try:
+            stream.write(_printable(text, stream))
+            stream.flush()
+        except (OSError, ValueError):  # nobody reads any more (`| head`), the disk is full, or it is closed
+            _silence(stream)
+
+
+class _ToFile(logging.FileHandler):
+    """Messages to a file; one that can be written no longer costs one warning."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        _LOG.removeHandler(self)  # first, since the warning would come here too
+        _LOG.warning(f"{self.baseFilename} cannot be written ({sys.exc_info()[1]}): further messages are not in it.")
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):  # what is left over of a disk that is full
+            super().close()
 
 
 def setup() -> None:
     """Sends messages to the terminal and quietens libraries that report on themselves."""
+    _open_streams()
     if not any(isinstance(handler, _ToStream) for handler in _LOG.handlers):
         _LOG.addHandler(_ToStream(logging.INFO))
     _LOG.setLevel(logging.DEBUG)
@@ -58,8 +81,15 @@ def error(message: str) -> None:
 
 @contextlib.contextmanager
 def log_to(path: Path) -> Iterator[None]:
-    """Appends every message, with its time, to a file as well."""
-    handler = logging.FileHandler(path, encoding="utf-8")
+    """Appends every message, with its time, to a file as well.
+
+    Raises:
+        UserError: it cannot be opened.
+    """
+    try:
+        handler = _ToFile(path, encoding="utf-8", errors="backslashreplace")
+    except OSError as error:
+        raise unwritable(path, error) from error
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
     _LOG.addHandler(handler)
     try:
@@ -67,3 +97,44 @@ def log_to(path: Path) -> Iterator[None]:
     finally:
         _LOG.removeHandler(handler)
         handler.close()
+
+
+def _open_streams() -> None:
+    """Lets libraries print too: characters that a terminal lacks are replaced, and a stream that was closed leads
+    nowhere. Its number would otherwise be that of the next file that is opened, into which others then print.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            with contextlib.suppress(OSError):
+                _close_gap(number)
+            setattr(sys, name, open(os.devnull, "r" if number == 0 else "w"))  # noqa: SIM115 - for good
+        elif number and getattr(stream, "errors", None) == "strict" and hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="replace")
+
+
+def _close_gap(number: int) -> None:
+    try:
+        os.fstat(number)
+    except OSError:
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        if nowhere != number:
+            os.dup2(nowhere, number)
+            os.close(nowhere)
+
+
+def _printable(text: str, stream: TextIO) -> str:
+    """The text with a question mark in place of what the stream cannot take."""
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    try:
+        return text.encode(encoding, "replace").decode(encoding, "replace")
+    except LookupError:  # an encoding that Python does not know
+        return text.encode("ascii", "replace").decode()
+
+
+def _silence(stream: TextIO) -> None:
+    """Leads a stream nowhere, so that neither we nor a library at the end of the process write into it again."""
+    with contextlib.suppress(OSError, ValueError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)

@@ -52,7 +52,8 @@ def replacing(path: Path, keep: Path | None = None) -> Iterator[IO[bytes]]:
     except OSError as error:
         raise unwritable(path, error) from error
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # a file system without write access says so before it looks for the file
+            part.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -73,8 +74,8 @@ def read_json(path: Path) -> dict[str, Any]:
         UserError: it is missing or damaged.
     """
     try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
         raise UserError(f"{path} cannot be read ({error}): remove it and run the same command again.") from error
     if not isinstance(content, dict):
         raise UserError(f"{path} holds no JSON object: remove it and run the same command again.")

@@ -3,14 +3,41 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import inspect
 import json
+import os
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, ValidationError
 
 from apex_lab.base.errors import UserError
+
+LONGEST = 300
+"""Characters of a value that a sentence shows."""
+
+
+def _openable(path: str) -> str:
+    """A path that the system can look for; there need not be anything.
+
+    Raises:
+        ValueError: empty, too long, or with characters that no path has.
+    """
+    if not path.strip():
+        raise ValueError("it is empty, as an unset variable is: give a path")
+    try:
+        os.lstat(path)
+    except OSError as error:
+        if error.errno in (errno.ENAMETOOLONG, errno.EINVAL):
+            raise ValueError(f"no path can be so ({error.strerror})") from error
+    except ValueError as error:
+        raise ValueError(f"no path can be so ({error})") from error
+    return path
+
+
+PathText = Annotated[str, AfterValidator(_openable)]
+"""A path in a configuration: not empty, and possible on this system."""
 
 
 def one_line(error: BaseException | str) -> str:
@@ -26,8 +53,9 @@ def sentence(text: str) -> str:
 
 
 def shown(value: object) -> str:
-    """A value as one would write it in a configuration."""
-    return json.dumps(value, ensure_ascii=False, default=str).replace('"', "'")
+    """A value as one would write it in a configuration; the middle of a long one is left out."""
+    text = json.dumps(value, ensure_ascii=False, default=str).replace('"', "'")
+    return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} ... {text[-LONGEST // 2 :]}"
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

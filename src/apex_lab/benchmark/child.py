@@ -9,6 +9,7 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
+from apex_lab.base import faults
 from apex_lab.base.errors import UserError
 
 Asked = TypeVar("Asked")
@@ -19,8 +20,8 @@ def in_child(work: Callable[[Asked], Told], asked: Asked) -> Told:
     """`work(asked)`, done by a fresh process; `work` is a function of a module.
 
     Raises:
-        UserError: what the work raised as one, or the process ended without a result (as it does out of memory).
-        RuntimeError: the work raised something else; its traceback is on stderr.
+        UserError: what the work raised, or the process was ended (as it is out of memory).
+        RuntimeError: the process ended by itself without a result.
     """
     context = multiprocessing.get_context("spawn")
     receive, send = context.Pipe(duplex=False)
@@ -57,7 +58,9 @@ def death(process: BaseProcess, what: str) -> UserError | RuntimeError:
 def _serve(work: Callable[[Asked], Told], asked: Asked, send: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it too, and ends this process
     try:
-        send.send(work(asked))
+        with faults.net():
+            found = work(asked)
+        send.send(found)
     except UserError as error:
-        send.send(error)
+        send.send(UserError(str(error)))  # without its cause, which may not travel
     send.close()

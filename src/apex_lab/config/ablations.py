@@ -53,6 +53,30 @@ def check(raw: Mapping[str, Any], choices: Mapping[str, str], conf: Path) -> Non
         _compare(raw, name, key, value)
 
 
+def explain(sentence: str, choices: Mapping[str, str], conf: Path) -> None:
+    """Names the ablation where it is what sets a key that the model does not have.
+
+    Args:
+        sentence: what is wrong with a configuration.
+        choices: group -> word.
+        conf: folder of configuration files.
+
+    Raises:
+        UserError: the ablation sets the unknown key.
+    """
+    name = choices.get("ablation")
+    file = conf / "ablation" / f"{name}.yaml"
+    unknown = re.match(r"Unknown key ([\w.]+)", sentence)
+    if name is None or unknown is None or not file.is_file():
+        return
+    key = unknown.group(1)
+    if any(own == key or own.startswith(f"{key}.") for own, _ in _values(file)):
+        raise UserError(
+            f"+ablation={name} sets {key}, which model={choices.get('model')} does not have: leave out the ablation, "
+            "or choose the model that it is of."
+        )
+
+
 def _compare(raw: Mapping[str, Any], name: str, key: str, value: Any) -> None:
     found = _at(raw, key)
     if not _same(found, value):

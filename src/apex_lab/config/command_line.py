@@ -6,43 +6,40 @@ of four jobs' misspelt value is found before the first one starts, `++` included
 
 from __future__ import annotations
 
+import contextlib
 import os
-import re
 import shlex
 import sys
-import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import hydra
-from hydra._internal.utils import get_args_parser
+from hydra import version
+from hydra._internal.utils import _run_hydra, get_args_parser
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
 
-from apex_lab.base import attached, console, interrupts
+from apex_lab.base import attached, console, faults, interrupts
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.interrupts import Interrupted, interruptible
 from apex_lab.base.validation import one_line
 from apex_lab.config import elsewhere
-from apex_lab.config.composition import (
-    Composed,
-    chosen,
-    composing,
-    conf_dir,
-    full_names,
-    plain,
-)
+from apex_lab.config.composition import Composed, chosen, composing, conf_dir, plain, told
 from apex_lab.config.elsewhere import Origin
 from apex_lab.config.job_list import expand
+from apex_lab.config.options import arrange, only_asks, options, passed_on
 from apex_lab.config.preflight import (
     Check,
+    asks_for_sweep,
     check_groups,
     check_hydra_keys,
     check_launcher,
     composed_jobs,
+    of_all_jobs,
     search_path,
     swept_by_files,
 )
@@ -103,33 +100,32 @@ def launch(command: Command) -> None:
         except UserError as error:
             return end("failed", JobFailed(one_line(error)), str(error))
         except Exception as error:  # noqa: BLE001 - reported below; the other jobs of a sweep must still run
-            traceback.print_exc()
-            return end("failed", JobFailed(f"{type(error).__name__}: {one_line(error)}"))
+            return end("failed", JobFailed(faults.cited(error)), faults.told(error))
         ended.append((state, None))
         return state
 
-    def end(state: str, error: JobFailed | JobBusy, message: str | None = None) -> str:
+    def end(state: str, error: JobFailed | JobBusy, message: str) -> str:
         """Reports a failure to whoever has started the job."""
         swept = HydraConfig.get().mode == RunMode.MULTIRUN
-        if message is not None and not (swept and state == "busy"):
+        if not (swept and state == "busy"):
             console.error(message)
         if swept:
             raise error  # comes back through Hydra's job return
         ended.append((state, str(error)))
         return state
 
-    sys.argv[1:] = _options_last([_quoted(word, command.literal) for word in sys.argv[1:]])
-    if command.model_groups:
-        sys.argv[1:] = full_names(sys.argv[1:])
-    if command.any_data:
-        sys.argv[1:] = [f"++{word}" if word.startswith("data.") else word for word in sys.argv[1:]]
     sweep = Sweep([], command.known)
     try:
-        with interruptible():
+        with faults.net(), interruptible():
+            arrange(command.literal, command.model_groups)
+            if command.any_data:
+                # the checkpoint brings the data's settings, so no file here has them; the check knows which exist
+                sys.argv[1:] = [f"++{word}" if word.startswith("data.") else word for word in sys.argv[1:]]
             sweep.items = _preflight(command)
             jobs = [item.words for item in sweep.items]
-            task = _Task(Origin.here(f"apex_lab.{command.config_name}", _options(), jobs), do, sweep)
-            hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name=command.config_name)(task)()
+            task = _Task(Origin.here(f"apex_lab.{command.config_name}", passed_on(), jobs), do, sweep)
+            with _raising():
+                _hydra(task, command.config_name)
     except UserError as error:
         console.error(str(error))
         attached.tell("failed", one_line(error))
@@ -147,6 +143,43 @@ def launch(command: Command) -> None:
         sys.exit(RUN_ERROR)
     if sweep.stopped is not None:
         sys.exit(128 + sweep.stopped)
+
+
+def _hydra(task: _Task, name: str) -> None:
+    """What `hydra.main` does, with the words that Hydra needs.
+
+    Of a sweep that is expanded already, Hydra composes what is common to all jobs: it is left without the words that
+    only some of them may fit.
+    """
+    version.setbase("1.3")
+    asked = options()
+    if task.sweep is not None and task.sweep.items:
+        asked.overrides = of_all_jobs(asked.overrides)
+    _run_hydra(asked, get_args_parser(), task, str(conf_dir()), name)
+
+
+@contextlib.contextmanager
+def _raising() -> Iterator[None]:
+    """Inside, Hydra raises what it would print in many lines before it ends the process.
+
+    Raises:
+        UserError: Hydra or OmegaConf refused something, in one sentence.
+    """
+    before = os.environ.get(_RAISES)
+    os.environ[_RAISES] = "1"
+    try:
+        yield
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(told(error, options().overrides)) from error
+    finally:
+        if before is None:
+            del os.environ[_RAISES]
+        else:
+            os.environ[_RAISES] = before
+
+
+_RAISES = "HYDRA_FULL_ERROR"
+"""The variable by which Hydra is asked to raise."""
 
 
 @dataclass
@@ -173,18 +206,6 @@ class _Task:
         return _Task, (self.origin, None, None)
 
 
-def _options() -> list[str]:
-    """The options of this command, besides its words, that each of its jobs needs."""
-    arguments = get_args_parser().parse_args()
-    options = []
-    for name in ("config_dir", "config_path"):
-        if (value := getattr(arguments, name)) is not None:
-            options += [f"--{name.replace('_', '-')}", str(Path(value).absolute())]
-    if arguments.config_name is not None:
-        options += ["--config-name", arguments.config_name]
-    return options
-
-
 def _preflight(command: Command) -> list[Item]:
     """Composes and checks every job of the command line, unless it only asks for help or for the configuration.
 
@@ -194,10 +215,8 @@ def _preflight(command: Command) -> list[Item]:
     Raises:
         UserError: what Hydra or the check refuses, in one sentence.
     """
-    arguments = get_args_parser().parse_args()
-    if arguments.multirun and (arguments.cfg or arguments.info):
-        raise UserError("-m cannot stand beside --cfg or --info: leave it out to see one job's configuration.")
-    if arguments.help or arguments.hydra_help or arguments.info or arguments.shell_completion or arguments.cfg:
+    arguments = options()
+    if only_asks(arguments):
         return []
     extra = search_path(arguments.config_dir)
     name = arguments.config_name or command.config_name
@@ -205,7 +224,7 @@ def _preflight(command: Command) -> list[Item]:
     with composing(overrides, arguments.config_path):
         check_hydra_keys(name, extra, overrides)
         check_groups(command.config_name, overrides)
-        if not (arguments.multirun or "hydra.mode=MULTIRUN" in overrides):
+        if not (arguments.multirun or asks_for_sweep(name, extra, overrides)):
             _checked(command, name, extra, [tuple(overrides)])
             return []
         check_launcher(name, extra, overrides)
@@ -227,8 +246,8 @@ def take_words(wanted: Callable[[str], bool]) -> tuple[list[str], str | None]:
     Raises:
         UserError: `-m` is among the options.
     """
-    sys.argv[1:] = full_names(_options_last(sys.argv[1:]))
-    arguments = get_args_parser().parse_args()
+    arrange()
+    arguments = options()
     if arguments.multirun:
         raise UserError("-m starts many runs, and this command starts its own: leave it out.")
     taken = [word for word in arguments.overrides if wanted(word.lstrip("+~").partition("=")[0])]
@@ -250,29 +269,6 @@ def _checked(command: Command, name: str, extra: Sequence[str], jobs: Sequence[t
             job = command.reseeded(first[rest], made)
         items.append(Item(made.words, job, command.title(job)))
     return items
-
-
-def _quoted(word: str, literal: Sequence[str]) -> str:
-    """The word with its value in quotes, if its key is one of names of files and the value is not a list or quoted."""
-    key, equals, value = word.partition("=")
-    if key.lstrip("+") not in literal or not equals or value in ("", "null") or value[0] in "['\"":
-        return word
-    # in quotes a backslash stands for itself, unless it comes before a quote or the end
-    escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value)
-    return f"{key}={equals[1:]}'{escaped}'"
-
-
-def _options_last(arguments: Sequence[str]) -> list[str]:
-    """The same command line with all overrides in one piece, so that `-m` may stand anywhere."""
-    known, rest = get_args_parser().parse_known_args(list(arguments))
-    late = [word for word in rest if not word.startswith("-")]
-    if not late:
-        return list(arguments)
-    early = list(known.overrides)
-    options = list(arguments)
-    for word in [*early, *late]:
-        options.remove(word)
-    return [*early, *late, *options]
 
 
 def command_line() -> str:

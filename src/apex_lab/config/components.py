@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import inspect
 import pkgutil
+import re
 import types
 import typing
 from abc import ABCMeta
@@ -19,7 +20,9 @@ from typing import Any
 from pydantic import ConfigDict, create_model
 from pydantic.errors import PydanticSchemaGenerationError, PydanticUndefinedAnnotation
 
+from apex_lab.base import faults
 from apex_lab.base.errors import UserError
+from apex_lab.base.machine import GIGABYTE, free_memory
 from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
 
 Node = Mapping[str, Any]
@@ -48,7 +51,7 @@ def target_of(node: Node, key: str) -> Callable[..., Any]:
         raise UserError(f"{key}._target_ = {shown(name)} is not the name of a class, such as 'torch.optim.Adam'.")
     try:
         target = pkgutil.resolve_name(name)
-    except Exception as error:  # importing a module can raise anything
+    except (Exception, SystemExit) as error:  # importing a module can raise anything
         raise UserError(sentence(f"{key}._target_ = '{name}' cannot be imported: {one_line(error)}")) from error
     if not callable(target):
         raise UserError(f"{key}._target_ = '{name}' is not a class or function.")
@@ -104,7 +107,7 @@ def build(node: Node, key: str, **supplied: Any) -> Any:
     """Builds a checked component and all components inside it; what a constructor refuses becomes one sentence.
 
     Raises:
-        UserError: a constructor raised ValueError, TypeError or UserError.
+        UserError: a constructor raised something.
     """
     arguments = {name: _build_inside(value, f"{key}.{name}") for name, value in arguments_of(node).items()}
     if node.get("_partial_"):
@@ -115,6 +118,19 @@ def build(node: Node, key: str, **supplied: Any) -> Any:
         raise UserError(sentence(f"{key}: {one_line(error)}")) from error
     except (ValueError, TypeError) as error:
         raise UserError(sentence(f"{key} ({node['_target_']}): {one_line(error)}")) from error
+    except Exception as error:
+        raise UserError(_broken(error, f"{key} ({node['_target_']})")) from error
+    except SystemExit as error:  # of a function that is no component, such as sys.exit
+        raise UserError(f"{key} ({node['_target_']}) ends the program: it is no component.") from error
+
+
+def _broken(error: Exception, where: str) -> str:
+    """The sentence for what a constructor has not foreseen."""
+    if isinstance(error, MemoryError) or "can't allocate memory" in str(error):
+        asked = re.search(r"(\d+) bytes", str(error))
+        size = f"{int(asked.group(1)) / GIGABYTE:,.1f} GB at once" if asked else "more memory"
+        return f"{where} asks for {size}, and {free_memory() / GIGABYTE:.1f} GB are free here: choose smaller sizes."
+    return faults.told(error, where)
 
 
 def _build_inside(value: Any, key: str) -> Any:

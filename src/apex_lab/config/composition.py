@@ -89,14 +89,25 @@ def chosen(runtime: Any) -> dict[str, str]:
     """
     choices = runtime.choices.items()
     found = {str(k): str(v) for k, v in choices if not str(k).startswith("hydra/") and v is not None}
-    for key in found:
+    for key, word in found.items():
         group, elsewhere, package = key.partition("@")
+        if not _CHOSEN.fullmatch(word):  # such as ../model/apex: it would stand in the name of the run's folder
+            raise UserError(f"{key}={word} is no name of a choice: write {key}={_stem(word)}.")
         if elsewhere:  # no check of a choice would see it
             raise UserError(f"{key}={found[key]}: a choice of {group} has its own place: leave out @{package}.")
     folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
     return {
         group: word for group, word in found.items() if any((at / group / f"{word}.yaml").is_file() for at in folders)
     }
+
+
+_CHOSEN = re.compile(r"\w[\w+-]*(/\w[\w+-]*)*")
+"""Names of files in a group, without their ending, in folders of it perhaps."""
+
+
+def _stem(word: str) -> str:
+    """The name that a path was meant to be, as far as that shows."""
+    return word.rpartition("/")[2].removesuffix(".yaml").removesuffix(".yml") or "..."
 
 
 def full_names(words: Sequence[str]) -> list[str]:
@@ -126,6 +137,10 @@ def composing(overrides: Sequence[str], folder: str | None = None) -> Iterator[N
             yield
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(told(error, overrides)) from error
+    except ValueError as error:
+        if not str(error).startswith("Config group override must be"):
+            raise
+        raise UserError(_no_choice(overrides)) from error
     finally:
         GlobalHydra.instance().clear()
 
@@ -234,6 +249,18 @@ def _check_shipped(content: Mapping[str, Any], folders: Sequence[Path], source: 
                 raise UserError(f"{source} may only choose files of apex_lab, and {name} lies elsewhere.")
 
 
+def _no_choice(overrides: Sequence[str]) -> str:
+    """The sentence for a group that gets a number or null in place of a word."""
+    for override in OverridesParser.create().parse_overrides(list(overrides)):
+        group = override.key_or_group
+        values = list(override.sweep_iterator()) if override.is_discrete_sweep() else [override.value()]
+        folder = conf_dir() / group
+        if folder.is_dir() and not all(isinstance(value, str | list) for value in values):
+            known = sorted(path.stem for path in folder.glob("*.yaml"))
+            return sentence(f"{override.input_line} names no choice of {group}: write one of {', '.join(known)}")
+    return "A choice is a word, and one of these is a number or null: " + sentence(" ".join(overrides))
+
+
 def not_there(error: Exception) -> str | None:
     """The key that no chosen file sets, where that is what Hydra refuses."""
     found = re.match(r"Could not override '([^']+)'\.\s+To append to your config", str(error))
@@ -259,7 +286,11 @@ def told(error: Exception, overrides: Sequence[str]) -> str:
             return f"{key}={values} holds several values: add -m to run them all."
         return f"{key}={values} holds several values: add -m to run them all, or write {key}=[{values}] for a list."
     if isinstance(error, OverrideParseException):
-        return sentence(f"'{error.override}' cannot be read as key=value: {text.splitlines()[0]}")
+        key, equals, value = str(error.override).partition("=")
+        advice = ""
+        if equals and "'" not in value and '"' not in value and "\\" not in value and not value.startswith(("[", "{")):
+            advice = f""" (in a value with special characters, quote it for Hydra too: '{key}="{value}"')"""
+        return sentence(f"'{error.override}' cannot be read as key=value: {text.splitlines()[0]}{advice}")
     unlisted = re.match(r"(?:In '([^']+)': )?Could not override '([^']+)'\.\s+No match in the defaults list", text)
     if unlisted:
         inside, group = unlisted.groups()

@@ -13,13 +13,18 @@ Keys stand as on the command line. A key that the command gives too has the comm
 
 from __future__ import annotations
 
+import copy
 import itertools
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hydra import compose
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Glob, Override
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 from pydantic import BaseModel, ConfigDict
@@ -70,6 +75,11 @@ def expand(overrides: Sequence[str], extra: Sequence[str] = ()) -> list[Words]:
             continue
         if override.key_or_group == "sweep":
             sweeps += _values(override)
+        elif isinstance(override.value(), Glob):
+            override.config_loader = _loader(extra)
+            given[key] = [f"{key}={value}" for value in _values(override)]
+            if not given[key]:
+                raise UserError(f"{override.input_line} fits no choice of {override.key_or_group}.")
         elif override.is_delete() and override.value() is None:
             given[key] = [key]
         else:
@@ -81,6 +91,15 @@ def expand(overrides: Sequence[str], extra: Sequence[str] = ()) -> list[Words]:
         for entry in read_sweep(name, extra):
             jobs += _product(entry, given)
     return list({frozenset(job): job for job in jobs}.values())
+
+
+def _loader(extra: Sequence[str]) -> ConfigLoader:
+    """What finds the choices of a group, in the folder given as `--config-dir` too."""
+    loader = GlobalHydra.instance().config_loader()
+    path = copy.deepcopy(loader.get_search_path())
+    for folder in re.findall(r"file://[^\],]+", " ".join(extra)):
+        path.append("command-line", folder)
+    return ConfigLoaderImpl(path)
 
 
 def _product(entry: Mapping[str, Sequence[str]], given: Mapping[str, Sequence[str]]) -> list[Words]:

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose
-from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
@@ -22,6 +21,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, sentence
 from apex_lab.config.composition import CHOICES, Composed, composed, composing, full_names, not_there, told
 from apex_lab.config.job_list import expand, sweeps, tables_of
+from apex_lab.config.options import at_home, options
 
 Check = Callable[[dict[str, Any], dict[str, str], Sequence[str]], Any]
 """(plain configuration, group -> word, overrides) -> a checked job; raises UserError."""
@@ -39,7 +39,7 @@ def listed(overrides: Sequence[str], config_dir: str | None = None) -> list[Comp
     Raises:
         UserError: what Hydra refuses, in one sentence.
     """
-    overrides, extra = full_names(overrides), search_path(config_dir)
+    overrides, extra = [at_home(word) for word in full_names(overrides)], search_path(config_dir)
     with composing(overrides):
         check_hydra_keys("train", extra, overrides)
         check_groups("train", overrides)
@@ -87,12 +87,32 @@ def search_path(config_dir: str | None) -> list[str]:
     return [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"]
 
 
+def asks_for_sweep(name: str, extra: Sequence[str], overrides: Sequence[str]) -> bool:
+    """Whether `hydra.mode`, in a word or in the file of an experiment, asks for what `-m` asks for."""
+    keys = {o.key_or_group: o for o in OverridesParser.create().parse_overrides(list(overrides))}
+    if "hydra.mode" not in keys and "experiment" not in keys:
+        return False
+    config = compose(name, overrides=[*extra, *of_all_jobs(overrides)], return_hydra_config=True)
+    return getattr(config.hydra.mode, "name", None) == "MULTIRUN"
+
+
 def swept_by_files(name: str, extra: Sequence[str], overrides: Sequence[str]) -> list[str]:
     """What configuration files sweep by `hydra.sweeper.params`, as words of a command line."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     groups = [str(o.input_line) for o in parsed if o.key_or_group in CHOICES and not o.is_sweep_override()]
     config = compose(name, overrides=[*extra, *groups], return_hydra_config=True)
     return [f"{key}={value}" for key, value in (config.hydra.sweeper.get("params") or {}).items()]
+
+
+def of_all_jobs(overrides: Sequence[str]) -> list[str]:
+    """Those words of a sweep that say how its jobs are launched, or choose files that may say so."""
+    parsed = OverridesParser.create().parse_overrides(list(overrides))
+    mine = ("hydra.", "hydra/", "paths.")
+    return [
+        str(o.input_line)
+        for o in parsed
+        if not o.is_sweep_override() and (o.key_or_group in (*CHOICES, "paths") or o.key_or_group.startswith(mine))
+    ]
 
 
 def job_of(name: str, words: Sequence[str], check: Check) -> Any:
@@ -108,7 +128,7 @@ def job_of(name: str, words: Sequence[str], check: Check) -> Any:
     Raises:
         UserError: what Hydra or the check refuses, in one sentence.
     """
-    extra = search_path(get_args_parser().parse_args().config_dir)
+    extra = search_path(options().config_dir)
     try:
         (made,) = composed_jobs(check, name, extra, [tuple(words)])
     except (HydraException, OmegaConfBaseException) as error:
@@ -164,6 +184,10 @@ def check_launcher(name: str, extra: Sequence[str], overrides: Sequence[str]) ->
     if not words:
         return
     hydra_part = compose(name, overrides=[*extra, *words], return_hydra_config=True).hydra
+    for part in ("launcher", "sweeper"):
+        target = str(hydra_part[part].get("_target_"))
+        if not target.startswith(("hydra_plugins.", "hydra._internal.")):
+            raise UserError(f"hydra.{part}._target_={target} is no {part} of Hydra: choose one by hydra/{part}=...")
     for key in ("tasks_per_node", "nodes"):
         if hydra_part.launcher.get(key, 1) != 1:
             raise UserError(
@@ -187,6 +211,8 @@ def check_groups(command: str, overrides: Sequence[str]) -> None:
     given: dict[str, str] = {}
     for override in OverridesParser.create().parse_overrides(list(overrides)):
         key = override.key_or_group
+        if override.is_delete() and override.value() is None and key in ("model", "data", "scale", "trainer", "paths"):
+            raise UserError(f"~{key} leaves no {key}, and every run has one: choose it by {key}=...")
         if key not in CHOICES or override.is_delete() or override.is_sweep_override():
             continue
         word = override.get_value_element_as_str()

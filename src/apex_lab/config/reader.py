@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NoReturn
 
-from apex_lab.base import console
+from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import sentence
 from apex_lab.config.command_line import CONFIG_ERROR
@@ -44,14 +44,15 @@ class Reader(argparse.ArgumentParser):
 
 @contextmanager
 def ending(code: int = CONFIG_ERROR) -> Iterator[None]:
-    """Inside, a `UserError` ends the process with its sentence on standard error.
+    """Inside, an exception ends the process with one sentence on standard error.
 
     Args:
         code: of the process.
     """
     console.setup()
     try:
-        yield
+        with faults.net():
+            yield
     except UserError as error:
         console.error(str(error))
         sys.exit(code)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -11,8 +13,9 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import did_you_mean, one_line, sentence, shown, validate
-from apex_lab.config import ablations, components
+from apex_lab.base.validation import PathText, did_you_mean, sentence, shown, validate
+from apex_lab.config import ablations, components, limits
+from apex_lab.config.checks import RATE, check_range, check_update, looked_at, refuse_checkpoints, refuse_others
 from apex_lab.config.components import is_node
 from apex_lab.config.composition import Composed, conf_dir
 from apex_lab.data.source import VideoSource
@@ -73,8 +76,8 @@ class EvaluationPart(_Part):
 class PathsPart(_Part):
     """Folders; relative ones are taken from where the command was started."""
 
-    outputs: str = Field(min_length=1)
-    data: str = Field(min_length=1)
+    outputs: PathText
+    data: PathText
 
 
 class Config(_Part):
@@ -163,6 +166,7 @@ def check_job(
     raw = {key: value for key, value in raw.items() if key != "hydra"}
     if "sweep" in raw:
         raise UserError(f"+sweep={choices.get('sweep', '...')} lists several jobs: add -m to run them.")
+    limits.refuse_long_numbers(raw)
     groups = [folder.name for folder in conf_dir().iterdir() if folder.is_dir()]
     config = validate(Config, raw, "", also_known=groups)
     assert isinstance(config, Config)
@@ -171,13 +175,40 @@ def check_job(
         ablations.check(raw, choices, conf_dir())
     if needs_recipe and to_train:
         _check_recipe(config, choices)
-    _check_components(config)
+    try:
+        _check_components(config)
+    except UserError as error:
+        ablations.explain(str(error), choices, conf_dir())
+        _explain_merged(str(error), overrides)
+        raise
     if not to_train:
         return Job(config, raw, dict(choices), tuple(overrides))
-    _check_objective(config)
+    try:
+        with limits.bounded():
+            _check_objective(config)
+    except UserError as error:
+        ablations.explain(str(error), choices, conf_dir())
+        raise
+    limits.refuse_large_batches(raw, _longest_clip(config))
     _check_splits(config)
     _check_cuda_graph(config.trainer)
     return Job(config, raw, dict(choices), tuple(overrides))
+
+
+def _explain_merged(sentence: str, overrides: Sequence[str]) -> None:
+    """A dictionary on the command line is merged into the one in the files, so keys can be unknown that nobody typed.
+
+    Raises:
+        UserError: that is what has happened.
+    """
+    for word in overrides:
+        key, _, value = word.lstrip("+").partition("=")
+        unknown = re.match(rf"Unknown key {re.escape(key)}\.(\w+)", sentence)
+        if unknown and value.startswith("{") and unknown.group(1) not in value:
+            raise UserError(
+                f"{key}={{...}} is merged into what the files set there, {key}.{unknown.group(1)} among it: to replace "
+                f"all of it, write ~{key} '+{key}={{...}}'."
+            )
 
 
 def reseeded(job: Job, made: Composed) -> Job:
@@ -210,7 +241,7 @@ def build_model(config: Config) -> SceneModel:
     Raises:
         UserError: the constructor refuses its values, or it is no `SceneModel`.
     """
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), limits.bounded():
         torch.manual_seed(config.seed)
         model = components.build(config.model, "model")
     if not isinstance(model, SceneModel):
@@ -227,7 +258,8 @@ def build_optimizer(config: Config, parameters: Sequence[tuple[str, torch.nn.Par
     if config.optimizer is None:
         raise UserError("optimizer = null, but the model has weights to train: choose one, such as torch.optim.Adam.")
     optimizer = components.build(config.optimizer, "optimizer", params=parameters)
-    assert isinstance(optimizer, torch.optim.Optimizer)
+    if not isinstance(optimizer, torch.optim.Optimizer):
+        raise UserError(f"optimizer._target_ = {config.optimizer['_target_']!r} is not a torch.optim.Optimizer.")
     return optimizer
 
 
@@ -286,32 +318,24 @@ def _check_components(config: Config) -> None:
     if config.optimizer is not None:
         components.check(config.optimizer, "optimizer", supplied=["params"])
         rate = config.optimizer.get("lr")
-        if rate is not None and rate <= 0:
+        if isinstance(rate, int | float) and rate <= 0:
             raise UserError(f"optimizer.lr = {rate} is wrong: a learning rate is above 0.")
-    for name, node in config.schedule.items():
-        components.check(node, f"schedule.{name}")
-    numbers: dict[str, Any] = {f"loss.{name}": value for name, value in config.loss.items()}
+    numbers: dict[str, Any] = {f"schedule.{name}": node for name, node in config.schedule.items()}
+    numbers |= {f"loss.{name}": value for name, value in config.loss.items()}
     for key, value in {**numbers, "lr_scale": config.lr_scale, "clips.frames": config.clips.frames}.items():
         if isinstance(value, dict):
             if not is_node(value):
                 raise UserError(f"{key} = {shown(value)} is wrong: give a number or a schedule with a _target_.")
             components.check(value, key)
+            if not inspect.isclass(components.target_of(value, key)):
+                raise UserError(f"{key} is not a schedule: choose one of apex_lab.training.schedules.")
     for name, node in config.logger.items():
         components.check(node, f"logger.{name}", supplied=["run"])
+        refuse_others(node, f"logger.{name}", "Logger")
     for name, node in config.callbacks.items():
         components.check(node, f"callbacks.{name}")
-        _refuse_checkpoints(node, f"callbacks.{name}")
-
-
-def _refuse_checkpoints(node: Mapping[str, Any], key: str) -> None:
-    """A second writer of checkpoints would meet the files that a run resumes from."""
-    classes = getattr(components.target_of(node, key), "__mro__", ())
-    # by name, since this module needs no Lightning
-    if any(one.__name__ == "Checkpoint" and one.__module__.endswith(".callbacks.checkpoint") for one in classes):
-        raise UserError(
-            f"{key}: a run keeps its checkpoints itself (trainer.checkpoint_interval, trainer.monitor): "
-            f"leave {node['_target_']} out."
-        )
+        refuse_others(node, f"callbacks.{name}", "Callback")
+        refuse_checkpoints(node, f"callbacks.{name}")
 
 
 def _check_objective(config: Config) -> None:
@@ -334,17 +358,26 @@ def _check_objective(config: Config) -> None:
     ranges = dict.fromkeys(values, (0.0, math.inf)) | dict.fromkeys(
         (f"schedule.{name}" for name in schedules), (-math.inf, math.inf)
     )
-    ranges |= {f"schedule.{name}": limits for name, limits in model.schedule_ranges.items()}
+    ranges["lr_scale"] = (0.0, RATE)
+    ranges |= {f"schedule.{name}": within for name, within in model.schedule_ranges.items()}
     for key, value in values.items():
-        _check_range(key, value, ranges[key], config.trainer.max_steps)
+        check_range(key, value, ranges[key], config.trainer.max_steps)
     _same_names("schedule", schedules, model.schedule_ranges)
     _same_names("loss", weights, model.term_names)
     if model.needs_training:
         _check_early_stopping(config, model, source.labelled)
-        build_optimizer(config, [(name, p) for name, p in model.named_parameters() if p.requires_grad])
+        named = [(name, p) for name, p in model.named_parameters() if p.requires_grad]
+        check_update(lambda weights: build_optimizer(config, weights), named, (config.optimizer or {}).get("_target_"))
         _check_monitor("trainer.monitor", config.trainer.monitor, model)
         _check_clips(config)
         _check_ranks(config, model)
+
+
+def _longest_clip(config: Config) -> int | None:
+    """Frames of the longest training clip; None: whole videos."""
+    frames = build_clip_frames(config)
+    lengths = [frames(step) for step in looked_at(config.trainer.max_steps)]
+    return None if None in lengths else max(length for length in lengths if length is not None)
 
 
 def _check_ranks(config: Config, model: SceneModel) -> None:
@@ -373,7 +406,9 @@ def _check_ranks(config: Config, model: SceneModel) -> None:
 def _check_clips(config: Config) -> None:
     """Clips of at least a frame, and not longer than videos."""
     frames, longest = build_clip_frames(config), config.data.get("frames")
-    for step in range(config.trainer.max_steps) if isinstance(config.clips.frames, dict) else (0,):
+    last = config.trainer.max_steps
+    every = range(last) if last <= 100_000 else looked_at(last - 1)
+    for step in every if isinstance(config.clips.frames, dict) else (0,):
         wanted = frames(step)
         if wanted is None:
             continue
@@ -381,21 +416,6 @@ def _check_clips(config: Config) -> None:
             raise UserError(f"clips.frames is {wanted} at step {step}: a clip has at least one frame.")
         if isinstance(longest, int) and wanted > longest:
             raise UserError(f"clips.frames is {wanted} at step {step}, but videos have data.frames = {longest} frames.")
-
-
-def _check_range(key: str, schedule: Callable[[int], float], limits: tuple[float, float], last: int) -> None:
-    """A schedule must stay within its limits at every step that a run makes; looked at in at most some 1,000 steps."""
-    low, high = limits
-    for step in [*range(0, last, max(1, last // 1000)), last]:
-        try:
-            value = float(schedule(step))
-        except (TypeError, ValueError, AttributeError) as error:
-            raise UserError(
-                sentence(f"{key} is not a schedule, which gives a number for a step: {one_line(error)}")
-            ) from error
-        if not low <= value <= high:
-            reach = f"at least {low:g}" if math.isinf(high) else f"between {low:g} and {high:g}"
-            raise UserError(f"{key} is {value:g} at step {step}: it must be {reach}.")
 
 
 def _check_monitor(key: str, monitor: object, model: SceneModel) -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from pydantic import Field, ValidationError
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.validation import PathText
 from apex_lab.data.p2d import P2D
 from apex_lab.data.recorded import RecordedSource, Verify
 from recordings import Plan
@@ -47,7 +48,7 @@ class P2DSource(RecordedSource):
 
     def __init__(
         self,
-        root: str,
+        root: PathText,
         data_seed: Annotated[int, Field(ge=0)] = 0,
         train: Annotated[int, Field(gt=0)] = 2000,
         val: Annotated[int, Field(ge=0)] = 200,

@@ -32,6 +32,7 @@ from apex_lab.inference.loading import trained_model
 from apex_lab.inference.predictor import Predictor
 from apex_lab.metrics.evaluator import versions
 from apex_lab.runs import checkpoints, provenance
+from apex_lab.runs.state import is_whole
 from apex_lab.scene import SceneModel, schedule_at
 
 
@@ -145,7 +146,7 @@ def _evaluate(
     done = None if request.again else _done(folder, request, key)
     if done is not None:
         console.say(f"evaluated already (again=true does it once more): {folder / 'metrics.json'}")
-        pictures = sorted(view.glob("*"), key=_film_strip_first) if done["pictures"] else []
+        pictures = sorted(view.glob("*"), key=_film_strip_first) if done.get("pictures") else []
         exported = [export_path(folder, request.split, request.export)] if request.export is not None else []
         _show(request.split, done, [folder / "metrics.json", *exported, *pictures])
         return
@@ -235,8 +236,12 @@ def _digest(content: Mapping[str, Any], digits: int = 8) -> str:
 def _done(folder: Path, request: Request, key: str) -> dict[str, Any] | None:
     """What is stored of this very evaluation, if it came to its end and its export is still there."""
     file = folder / "metrics.json"
-    scored = read_json(file).get("splits", {}).get(request.split, {}) if file.exists() else {}
-    if scored.get("evaluation") != key:
+    try:
+        splits = read_json(file).get("splits") if file.exists() else None
+    except UserError:
+        return None  # what is made anew takes its place, and says so
+    scored = splits.get(request.split) if isinstance(splits, dict) else None
+    if not isinstance(scored, dict) or scored.get("evaluation") != key or not is_whole(scored):
         return None
     if request.export is not None and not export_path(folder, request.split, request.export).exists():
         return None

@@ -14,6 +14,7 @@ from apex_lab.base.progress import Meter
 from apex_lab.evaluation.results import summary
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.formats import score_predictions, write_result
+from apex_lab.formats.bounds import GIGABYTES
 from apex_lab.formats.scored_files import plain
 from apex_lab.metrics import by_property
 
@@ -30,6 +31,7 @@ class Predictions:
     resize: str | None
     output: Path
     scoring: ScoringPart
+    max_gigabytes: float = GIGABYTES
 
 
 def output_of(path: Path) -> Path:
@@ -77,6 +79,7 @@ def score_others(predictions: Predictions) -> None:
         partial=predictions.partial,
         resize=predictions.resize,
         settings=predictions.scoring.settings(tracks=True, details=True),
+        max_gigabytes=predictions.max_gigabytes,
         track=_metered,
     )
     result["by_property"] = by_property(result["per_object"])

@@ -15,6 +15,7 @@ from apex_lab.evaluation.pictures import Chosen
 from apex_lab.evaluation.score import Tally
 from apex_lab.formats.scored_files import plain
 from apex_lab.metrics import by_property
+from apex_lab.runs.state import is_whole
 
 COLUMNS = {"ari_fg": "ARI-FG", "msc_fg": "MSC-FG", "ari": "ARI", "msc": "MSC"}
 """The paper's segmentation scores: key -> heading."""
@@ -92,11 +93,6 @@ def store(
     return scored
 
 
-def _whole(scored: object) -> bool:
-    """Whether an entry of metrics.json's `splits` is one."""
-    return isinstance(scored, dict) and isinstance(scored.get("total"), dict)
-
-
 def _stored(path: Path) -> dict[str, Any]:
     """What is there already; a damaged file is set aside, so that the work that was just done is not lost."""
     if not path.exists():
@@ -106,11 +102,11 @@ def _stored(path: Path) -> dict[str, Any]:
     except UserError:
         content = {"splits": None}
     splits = content.get("splits", {})
-    if isinstance(splits, dict) and all(_whole(scored) for scored in splits.values()):
+    if isinstance(splits, dict) and all(is_whole(scored) for scored in splits.values()):
         return content
     aside = set_aside(path)
     console.warn(f"{path} was damaged and is set aside as {aside.name}: evaluate other splits that it held again.")
-    return {"splits": {k: v for k, v in splits.items() if _whole(v)} if isinstance(splits, dict) else {}}
+    return {"splits": {k: v for k, v in splits.items() if is_whole(v)} if isinstance(splits, dict) else {}}
 
 
 def unlabelled(tally: Tally) -> dict[str, Any]:
@@ -128,7 +124,7 @@ def summary(title: str, total: Mapping[str, Any]) -> str:
         title: what was scored, such as the split.
         total: scores of all videos together; None where one is undefined.
     """
-    lines = [f"{title}: {total['videos']} videos, {total['frames']} frames"]
+    lines = [f"{title}: {total.get('videos')} videos, {total.get('frames')} frames"]
     if not any(key in total for key in COLUMNS):
         return f"{lines[0]}; unlabelled, so there are no scores"
     for columns, digits in ((COLUMNS, 3), (TRACKING_COLUMNS, 1)):

@@ -39,7 +39,7 @@ class ScoringPart(_Part):
     """How videos are scored.
 
     Attributes:
-        tracking, public_first_frame, skip_empty, boundary_tolerance, ignore_label: as in
+        tracking, public_first_frame, first_frame, skip_empty, boundary_tolerance, ignore_label: as in
             `apex_lab.metrics.EvaluatorSettings`.
         identities: `own`, `none` and `linked` as there; `auto` is `own` for a model that tracks (`SceneModel.tracks`)
             and for files of predictions, else `none`.
@@ -49,6 +49,7 @@ class ScoringPart(_Part):
 
     tracking: TrackingPart = TrackingPart()
     public_first_frame: int | None = 2
+    first_frame: int = Field(default=0, ge=0)
     skip_empty: bool = False
     boundary_tolerance: float = TOLERANCE
     ignore_label: int | None = None
@@ -72,6 +73,7 @@ class ScoringPart(_Part):
         return EvaluatorSettings(
             tracking=TrackingSettings(**self.tracking.model_dump()),
             public_first_frame=self.public_first_frame,
+            first_frame=self.first_frame,
             skip_empty=self.skip_empty,
             boundary_tolerance=self.boundary_tolerance,
             ignore_label=self.ignore_label,

@@ -24,6 +24,7 @@ from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import draft_of
+from apex_lab.formats.bounds import check_integer, check_shape
 from apex_lab.formats.rle import UNPAINTED, encode, paint
 from apex_lab.formats.video import PredictedVideo, labels_of, with_rest
 from apex_lab.metrics.contingency import BACKGROUND
@@ -154,6 +155,7 @@ def _entry(entry: Any, where: str, truth: bool = False) -> tuple[int, int, Any]:
                 f"{where}: {key} is {value!r}; want an integer >= 0 (where identities mean nothing over time, number "
                 "the masks of each image and set scoring.identities=none)"
             )
+        check_integer(value, f"{where}: {key}")
     if "segmentation" not in entry:
         raise UserError(f"{where}: the key segmentation is missing; boxes hold no masks and cannot be scored")
     return entry["image_id"], entry["track_id"], entry["segmentation"]
@@ -179,7 +181,7 @@ class CocoTruth:
                 for image in page["images"]
             }
             annotations = list(page["annotations"])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise UserError(
                 f"{path} lacks {error}: ground truth in COCO's layout needs videos (id, name), images (id, width, "
                 "height, video_id, frame_id) and annotations"
@@ -188,7 +190,8 @@ class CocoTruth:
         self._frames: dict[str, list[int]] = {name: [] for name in self.names}
         self._sizes: dict[str, tuple[int, int]] = {}
         for name, frame, height, width in images.values():
-            self._frames[name].append(frame)
+            check_shape((height, width), 8, f"{path}, video {name!r}")
+            self._frames[name].append(check_integer(frame, f"{path}, video {name!r}: a frame_id"))
             if self._sizes.setdefault(name, (height, width)) != (height, width):
                 raise UserError(f"{path}: the images of video {name!r} differ in size; they must be alike")
         for name, frames in self._frames.items():
@@ -219,7 +222,9 @@ class CocoTruth:
         Raises:
             UserError: masks that are damaged, of another size or that overlap.
         """
-        found = np.full((len(self._frames[name]), *self._sizes[name]), UNPAINTED, dtype=np.int64)
+        shape = (len(self._frames[name]), *self._sizes[name])
+        check_shape(shape, 8, f"{self._path}, video {name!r}")
+        found = np.full(shape, UNPAINTED, dtype=np.int64)
         for frame, track, mask, where in self._annotations[name]:
             paint(found[frame], mask, track, UNPAINTED, where, "the image")
         return np.where(found == UNPAINTED, BACKGROUND, found)

@@ -15,12 +15,14 @@ from types import TracebackType
 
 import numpy as np
 from jaxtyping import Int64, UInt8
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.faults import cited
 from apex_lab.base.files import draft_of
 from apex_lab.base.order import natural_key
 from apex_lab.base.signed import is_signed, signature
+from apex_lab.formats.bounds import check_shape
 from apex_lab.formats.frames import numbered
 from apex_lab.formats.video import PredictedVideo, labels_of
 
@@ -118,23 +120,27 @@ def read_davis(path: str | Path, name: str) -> Int64[np.ndarray, "T H W"]:
             of indices.
     """
     files = list(frame_files(path, name).values())
-    frames = [_indices_of(file) for file in files]
+    frames = [_indices_of(file, len(files)) for file in files]
     for file, frame in zip(files, frames, strict=True):
         if frame.shape != frames[0].shape:
             raise UserError(f"{file} has the size {frame.shape}, the first frame {frames[0].shape}")
     return np.stack(frames)
 
 
-def _indices_of(file: Path) -> Int64[np.ndarray, "H W"]:
+def _indices_of(file: Path, count: int) -> Int64[np.ndarray, "H W"]:
+    """The indices of one of `count` images of a video."""
     try:
         with Image.open(file) as image:
             if image.mode not in LABEL_MODES:
                 raise UserError(f"{file} is a {image.mode} image; want one index per pixel (a palette or grey image)")
+            check_shape((count, image.height, image.width), 8, str(file))
             # Grey of 2 or 4 bits comes stretched to 0 to 255; labels are what is stored.
             stretched = {"L;2": 85, "L;4": 17}.get(_raw_mode(image), 1)
             return np.asarray(image).astype(np.int64) // stretched
-    except (UnidentifiedImageError, OSError, SyntaxError) as error:
-        raise UserError(f"{file} is no readable PNG ({error})") from error
+    except UserError:
+        raise
+    except Exception as error:  # what strange bytes make Pillow raise has no common class
+        raise UserError(f"{file} is no readable PNG ({cited(error)})") from error
 
 
 def _raw_mode(image: Image.Image) -> str:

@@ -15,6 +15,7 @@ from jaxtyping import Int64
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.order import natural_key
+from apex_lab.formats.bounds import check_file, check_integer, check_shape
 from apex_lab.formats.mot import IGNORED_CLASS
 from apex_lab.formats.rle import paint
 from apex_lab.formats.video import with_rest
@@ -88,7 +89,9 @@ class MotsTruth:
             UserError: boxes, masks that overlap or differ in size, frames after the end, or no way to know the size.
         """
         lines = list(_lines(self._files[name]))
-        found = np.full(self._shape(name, lines), ABSENT, dtype=np.int64)
+        shape = self._shape(name, lines)
+        check_shape(shape, 8, f"{self._path}, video {name!r}")
+        found = np.full(shape, ABSENT, dtype=np.int64)
         for line in lines:
             if line.frame >= len(found):
                 raise UserError(f"{line.where}: frame {line.frame + 1} is none of the {len(found)} of seqinfo.ini")
@@ -131,6 +134,7 @@ def _lines(file: Path) -> Iterator[_Line]:
         UserError: a line of another kind, or an id that a frame has more than once.
     """
     seen = set()
+    check_file(file)
     for number, text in enumerate(file.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         if not text.strip():
             continue
@@ -152,6 +156,8 @@ def _parse(text: str, where: str) -> _Line:
         raise UserError(f"{where}: want 'frame id class height width mask', got {text[:60]!r}") from error
     if identity < 1 or len(words) != 6:
         raise UserError(f"{where}: want 'frame id class height width mask' with an id from 1, got {text[:60]!r}")
+    for name, number in (("frame", frame), ("id", identity), ("class", kind)):
+        check_integer(number, f"{where}: the {name}")
     if frame < 1:
         raise UserError(f"{where}: frame {frame} is none: MOTS counts frames from 1; add 1 to all of them")
     return _Line(frame - 1, identity, kind, {"size": [height, width], "counts": counts}, where)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import os
 import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -19,13 +18,17 @@ import numpy as np
 from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.faults import cited
 from apex_lab.base.files import draft_of
+from apex_lab.formats.bounds import check_shape
 from apex_lab.formats.video import PredictedVideo, hard_segmentation, resized
 from apex_lab.scene import ABSENT
 
 PARTS = ("gt", "masks", "ids")
 _DIMENSIONS = {"gt": ("T", "H", "W"), "masks": ("T", "K", "H", "W"), "ids": ("T", "K")}
 _KINDS = {"gt": "ui", "masks": "fuib", "ids": "ui"}
+_LEAST = {"gt": 8, "masks": 4, "ids": 8}
+"""Bytes per element that scoring takes at least, whatever the file has."""
 _KIND_NAMES = {"gt": "integers", "masks": "real numbers", "ids": "integers"}
 
 
@@ -57,8 +60,10 @@ class NpzFile:
                     for name in archive.namelist()
                     if name.endswith(".npy") and _split(name)[1] in PARTS
                 }
-        except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
-            raise UserError(f"{self.path} is no readable npz file ({error}); write it with numpy.savez") from error
+        except Exception as error:  # what strange bytes raise has no common class
+            raise UserError(
+                f"{self.path} is no readable npz file ({cited(error)}); write it with numpy.savez"
+            ) from error
         self.names = list(dict.fromkeys(_split(key)[0] for key in headers))
         if not self.names:
             raise UserError(
@@ -120,8 +125,8 @@ class NpzFile:
         try:
             with zipfile.ZipFile(self.path) as archive, archive.open(f"{key}.npy") as file:
                 return np.lib.format.read_array(file, allow_pickle=False)
-        except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
-            raise UserError(f"array {key} of {self.path} is damaged ({error}); write the file again") from error
+        except Exception as error:
+            raise UserError(f"array {key} of {self.path} is damaged ({cited(error)}); write the file again") from error
 
     def _check(self, name: str, headers: dict[str, _Header], need: tuple[str, ...]) -> None:
         missing = [part for part in need if f"{name}__{part}" not in headers]
@@ -139,6 +144,7 @@ class NpzFile:
                 raise UserError(
                     f"{self.where(name)}: {part} has the shape {header.shape}; want ({wanted}), none of it 0"
                 )
+            check_shape(header.shape, max(header.dtype.itemsize, _LEAST[part]), f"{self.where(name)}, {part}")
             for axis, length in zip(_DIMENSIONS[part], header.shape, strict=True):
                 # The size of the images may differ on purpose, and is looked at where they meet.
                 if axis in "TK" and sizes.setdefault(axis, (length, part))[0] != length:

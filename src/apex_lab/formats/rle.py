@@ -49,12 +49,20 @@ def decode(mask: Any, size: tuple[int, int], where: str, size_of: str = "the gro
     try:
         height, width = mask["size"]
         counts = mask["counts"]
+        if type(height) is not int or type(width) is not int:
+            raise TypeError(f"its size is {mask['size']!r}, and two whole numbers are wanted")
         lengths = np.array(_unpack(counts) if isinstance(counts, str) else counts, dtype=np.int64)
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise UserError(f"{where}: a mask is no run-length encoding ({error!r})") from error
     if (height, width) != size:
         raise UserError(f"{where}: a mask is {height} x {width}, {size_of} {size[0]} x {size[1]}")
-    if lengths.ndim != 1 or (lengths < 0).any() or lengths.sum() != height * width:
+    # each by itself first: a sum of large ones may come round to any number
+    if (
+        lengths.ndim != 1
+        or ((lengths < 0) | (lengths > height * width)).any()
+        or len(lengths) > 2 * height * width + 2
+        or lengths.sum() != height * width
+    ):
         raise UserError(f"{where}: the runs of a mask do not fill its {height} x {width} pixels; it is damaged")
     # Runs of zeros and ones in turn, down the columns.
     pixels = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
@@ -74,6 +82,8 @@ def _unpack(text: str) -> list[int]:
         bits = ord(character) - 48
         if not 0 <= bits < 64:
             raise ValueError(f"{character!r} is no character of a compressed mask")
+        if shift > 60:
+            raise ValueError("a number in a compressed mask has more than 64 bits")
         number |= (bits & 31) << shift
         shift += 5
         if bits & 32:
@@ -102,7 +112,7 @@ def runs(mask: Bool[np.ndarray, "H W"]) -> str:
 def _from_runs(text: str, size: tuple[int, int], where: str) -> Bool[np.ndarray, "H W"]:
     try:
         pairs = np.array([int(word) for word in text.split()], dtype=np.int64).reshape(-1, 2)
-    except ValueError as error:
+    except (ValueError, OverflowError) as error:
         raise UserError(f"{where}: {text[:40]!r} is no list of starts and lengths") from error
     found = np.zeros(size[0] * size[1], dtype=bool)
     for start, length in pairs.tolist():

@@ -17,6 +17,7 @@ from jaxtyping import Int64, Integer
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import draft_of
+from apex_lab.formats.bounds import GIGABYTES, at_most
 from apex_lab.formats.coco import CocoTruth, Places, read_results, videos_with_results
 from apex_lab.formats.davis import frame_files, read_davis, video_names
 from apex_lab.formats.frames import check_pairs
@@ -56,6 +57,7 @@ def score_predictions(
     partial: bool = False,
     resize: str | None = None,
     settings: EvaluatorSettings | None = None,
+    max_gigabytes: float = GIGABYTES,
     track: Callable[[list[str]], Iterable[str]] = iter,
 ) -> dict[str, Any]:
     """Every metric of a file (or folder) of predictions, per frame, per video and in total.
@@ -70,6 +72,7 @@ def score_predictions(
         resize: what to do with masks of another size than the ground truth: bring soft `masks` to its size
             bilinearly, or the `truth` to theirs by nearest neighbour; None refuses them.
         settings: how to score; rows per frame and events are kept where missing.
+        max_gigabytes: bound of one video's arrays and of a file that is read at once, whatever it declares.
         track: wraps the list of video names, for a progress bar.
 
     Returns:
@@ -79,7 +82,20 @@ def score_predictions(
     Raises:
         UserError: files that are missing, damaged or malformed; names file, video, frame and value.
     """
-    path = Path(path)
+    with at_most(max_gigabytes):
+        return _scored(Path(path), format, truth, split, partial, resize, settings, track)
+
+
+def _scored(
+    path: Path,
+    format: str | None,
+    truth: str | Path | None,
+    split: str,
+    partial: bool,
+    resize: str | None,
+    settings: EvaluatorSettings | None,
+    track: Callable[[list[str]], Iterable[str]],
+) -> dict[str, Any]:
     settings = settings or EvaluatorSettings(per_frame=True, events=True)
     format = format or guess_format(path)
     if format not in get_args(Format):

@@ -10,7 +10,9 @@ import numpy as np
 from jaxtyping import Integer
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.faults import cited
 from apex_lab.data.p2d import P2D
+from apex_lab.formats.bounds import check_file
 from apex_lab.formats.coco import CocoTruth
 from apex_lab.formats.davis import frame_files, read_davis, video_names
 from apex_lab.formats.mots import MotsTruth, text_names
@@ -137,11 +139,12 @@ def load_json(path: Path) -> Any:
         UserError: there is none, or it is damaged.
     """
     try:
+        check_file(path)
         return json.loads(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError as error:
         raise UserError(f"there is no file {path}") from error
-    except (ValueError, OSError) as error:
-        raise UserError(f"{path} is no readable JSON file ({error})") from error
+    except (ValueError, OSError, RecursionError) as error:
+        raise UserError(f"{path} is no readable JSON file ({cited(error)})") from error
 
 
 def void_label(truth: Truth, name: str, labels: Integer[np.ndarray, "T H W"]) -> int | None:

@@ -27,6 +27,7 @@ from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import draft_of
+from apex_lab.formats.bounds import check_integer, check_shape
 from apex_lab.formats.rle import UNPAINTED, paint, runs
 from apex_lab.formats.video import PredictedVideo, labels_of, with_rest
 from apex_lab.metrics.contingency import BACKGROUND
@@ -132,9 +133,26 @@ def _checked(frame: Any, where: str) -> list[tuple[int, Any]]:
     for name in ids:
         if type(name) is not int or name < 0:
             raise UserError(f"{where}: the id {name!r} is no integer >= 0")
+        check_integer(name, f"{where}: an id")
         if ids.count(name) > 1:
             raise UserError(f"{where}: has the id {name} more than once; an identity can be in one place only")
     return pairs
+
+
+def _labelled(frame: Any, where: str) -> list[tuple[int, Any]]:
+    """Labels and masks of one frame of ground truth, that of the pixels to ignore among them."""
+    pairs = _checked(frame, where)
+    try:
+        labels = list(frame["labels"])
+        found = [(label, mask) for label, (_, mask) in zip(labels, pairs, strict=True)]
+        if "ignored" in frame:
+            label, mask = frame["ignored"]
+            found.append((label, mask))
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(
+            f"{where}: want one of 'labels' for each mask, and 'ignored' as a label and a mask, where it is there"
+        ) from error
+    return [(check_integer(label, f"{where}: a label"), mask) for label, mask in found]
 
 
 class WeisTruth:
@@ -157,7 +175,7 @@ class WeisTruth:
                 sizes = {tuple(frame["size"]) for frame in frames}
                 ((height, width),) = sizes
                 self._videos[str(name)] = (frames, (len(frames), int(height), int(width)))
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
                 raise UserError(
                     f"{path}, video {number}: its frames do not all have the keys video, size and labels that ground "
                     "truth of this layout needs; export it again, or give the truth as npz, COCO or PNGs"
@@ -173,12 +191,12 @@ class WeisTruth:
             UserError: masks that are damaged, of another size or that overlap.
         """
         frames, shape = self._videos[name]
+        check_shape(shape, 8, f"{self._path}, video {name!r}")
         found = np.full(shape, UNPAINTED, dtype=np.int64)
         for t, frame in enumerate(frames):
             where = f"{self._path}, video {name!r}, frame {t}"
-            masks = [(label, mask) for label, (_, mask) in zip(frame["labels"], _checked(frame, where), strict=True)]
-            for label, mask in [*masks, *([frame["ignored"]] if "ignored" in frame else [])]:
-                paint(found[t], mask, int(label), UNPAINTED, f"{where}, label {label}", "the frame")
+            for label, mask in _labelled(frame, where):
+                paint(found[t], mask, label, UNPAINTED, f"{where}, label {label}", "the frame")
         return np.where(found == UNPAINTED, BACKGROUND, found)
 
     def metadata(self, name: str) -> None:
@@ -190,4 +208,5 @@ class WeisTruth:
     def void(self, name: str) -> int | None:
         """The label that this video marks as ignored."""
         frames, _ = self._videos[name]
-        return next((frame["ignored"][0] for frame in frames if "ignored" in frame), None)
+        marked = ((t, frame) for t, frame in enumerate(frames) if "ignored" in frame)
+        return next((_labelled(frame, f"{self._path}, video {name!r}, frame {t}")[-1][0] for t, frame in marked), None)

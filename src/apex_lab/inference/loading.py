@@ -9,7 +9,7 @@ import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence
-from apex_lab.config import components
+from apex_lab.config import components, limits
 from apex_lab.scene import SceneModel
 
 
@@ -23,7 +23,7 @@ def trained_model(inference: Mapping[str, Any]) -> SceneModel:
         UserError: the node builds no model, or the weights do not fit it.
     """
     components.check(inference["model"], "model")
-    with torch.random.fork_rng(devices=[]):
+    with torch.random.fork_rng(devices=[]), limits.bounded(copies=1):
         model = components.build(inference["model"], "model")
     if not isinstance(model, SceneModel):
         raise UserError(f"model._target_ = {inference['model']['_target_']!r} is not an apex_lab.scene.SceneModel.")

@@ -33,6 +33,8 @@ class EvaluatorSettings:
         tracking: frames, thresholds and treatment of the background for CLEAR MOT, IDF1 and HOTA.
         public_first_frame: CLEAR MOT and IDF1 are given once more from this frame on (the public protocol); None
             leaves that out.
+        first_frame: segmentation is scored from this frame on, as if the video began there: every score of a frame or
+            a volume, J and F. Tracking has `tracking.first_frame`; results per object are of all frames.
         skip_empty: leaves frames without any object out of the foreground means of ARI and covering.
         boundary_tolerance: for F, a share of the image diagonal.
         identities: `own` are the model's; `none` leaves out all that needs identities over time (NaN); `linked` takes
@@ -44,6 +46,7 @@ class EvaluatorSettings:
 
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     public_first_frame: int | None = 2
+    first_frame: int = 0
     skip_empty: bool = False
     boundary_tolerance: float = TOLERANCE
     identities: Literal["own", "none", "linked"] = "own"
@@ -54,6 +57,8 @@ class EvaluatorSettings:
     def __post_init__(self) -> None:
         if self.identities not in ("own", "none", "linked"):
             raise ValueError(f"identities is {self.identities!r}; choose own, none or linked")
+        if self.first_frame < 0:
+            raise ValueError(f"first_frame is {self.first_frame}; frames are counted from 0")
         if not 0 < self.boundary_tolerance < 1:
             raise ValueError(f"boundary_tolerance is {self.boundary_tolerance}; it must lie in (0, 1)")
         self.protocols()
@@ -131,10 +136,10 @@ def score_video(
 ) -> VideoRecord:
     """Scores one video; arguments as in `Evaluator.add`, identities as they are."""
     prediction, truth = (np.ascontiguousarray(labels).astype(np.int64) for labels in (prediction, truth))
-    with _one_thread():
-        batch = contingency(torch.from_numpy(prediction)[None], torch.from_numpy(truth)[None], settings.ignore_label)
-    table = _Table(batch, batch.counts[0].numpy(), batch.labels[0].numpy(), batch.ids[0].numpy())
+    table = _table(prediction, truth, settings.ignore_label)
     columns = _frame_scores(table, settings.skip_empty)
+    for values in columns.values():
+        values[: settings.first_frame] = np.nan
     pixels = truth.shape[1] * truth.shape[2]
     scores = {name: _sum_and_count(values) for name, values in columns.items()}
     if settings.identities == "none":
@@ -144,23 +149,17 @@ def score_video(
         kept = np.flatnonzero(np.isin(table.ids, list(background_ids))).tolist()
         frames = {name: detections(table.counts, protocol, kept) for name, protocol in settings.protocols().items()}
         events = {name: clear_events(frames[name], p.min_iou) for name, p in settings.protocols().items()}
-        boundary = boundary_scores(
-            prediction,
-            truth,
-            table.counts,
-            table.labels,
-            table.ids,
-            settings.boundary_tolerance,
-            ignored_pixels(truth, settings.ignore_label),
-        )
-        tracks = _track_record(table, settings, frames, events, boundary)
+        boundary = _boundary(prediction, truth, table, settings)
+        cut = (table, boundary) if not settings.first_frame else _cut(prediction, truth, settings)
+        tracks = _track_record(table, cut, settings, frames, events)
         objects = object_rows(table.counts, table.labels, metadata, boundary, frames[""], events[""], pixels)
         if settings.per_frame:
-            columns |= _boundary_columns(boundary) | _tracking_columns(frames[""], events[""], len(truth))
+            columns |= _boundary_columns(cut[1] if cut else None, len(truth))
+            columns |= _tracking_columns(frames[""], events[""], len(truth))
     return VideoRecord(
         size=(truth.shape[1], truth.shape[2]),
         frames=len(truth),
-        empty_frames=int(batch.empty_frames.sum()),
+        empty_frames=int(table.batch.empty_frames.sum()),
         scores=scores,
         tracks=tracks,
         objects=objects,
@@ -181,29 +180,64 @@ def _frame_scores(table: _Table, skip_empty: bool) -> dict[str, Float64[np.ndarr
     return scores
 
 
-def _volume_scores(table: _Table, skip_empty: bool) -> dict[str, float]:
+def _table(
+    prediction: Int64[np.ndarray, "T H W"], truth: Int64[np.ndarray, "T H W"], ignore_label: int | None
+) -> _Table:
+    with _one_thread():
+        batch = contingency(torch.from_numpy(prediction)[None], torch.from_numpy(truth)[None], ignore_label)
+    return _Table(batch, batch.counts[0].numpy(), batch.labels[0].numpy(), batch.ids[0].numpy())
+
+
+def _volume_scores(table: _Table | None, skip_empty: bool) -> dict[str, float]:
+    if table is None:
+        return dict.fromkeys((f"video_{name}" for name in (*SCORES, "mbo", "miou")), math.nan)
     scores = {f"video_{name}": float(video_scores(table.batch, name, "sequence", skip_empty)) for name in SCORES}
     volume = table.counts.sum(axis=0)
     return scores | {"video_mbo": mean_best_overlap(volume), "video_miou": mean_matched_iou(volume)}
 
 
+def _cut(
+    prediction: Int64[np.ndarray, "T H W"], truth: Int64[np.ndarray, "T H W"], settings: EvaluatorSettings
+) -> tuple[_Table, BoundaryScores] | None:
+    """Table and boundaries of the frames from which on segmentation is scored, as if they were the whole video; None
+    where it ends before them.
+    """
+    prediction, truth = prediction[settings.first_frame :], truth[settings.first_frame :]
+    if not len(truth):
+        return None
+    table = _table(prediction, truth, settings.ignore_label)
+    return table, _boundary(prediction, truth, table, settings)
+
+
+def _boundary(
+    prediction: Int64[np.ndarray, "T H W"],
+    truth: Int64[np.ndarray, "T H W"],
+    table: _Table,
+    settings: EvaluatorSettings,
+) -> BoundaryScores:
+    ignored = ignored_pixels(truth, settings.ignore_label)
+    tolerance = settings.boundary_tolerance
+    return boundary_scores(prediction, truth, table.counts, table.labels, table.ids, tolerance, ignored)
+
+
 def _track_record(
     table: _Table,
+    cut: tuple[_Table, BoundaryScores] | None,
     settings: EvaluatorSettings,
     frames: dict[str, list[Detections]],
     events: dict[str, Events],
-    boundary: BoundaryScores,
 ) -> TrackRecord:
     shape = (len(table.labels), len(table.ids))
+    j, f = (cut[1].j, cut[1].f) if cut else (np.empty((0, 1)), np.empty((0, 1)))
     protocols = settings.protocols().items()
     return TrackRecord(
-        volumes=_volume_scores(table, settings.skip_empty),
+        volumes=_volume_scores(cut[0] if cut else None, settings.skip_empty),
         clear={name: TrackingCounts.of_video(frames[name], events[name], p.tracked_share) for name, p in protocols},
         identity={name: IdentityCounts.of_video(frames[name], shape, p.min_iou) for name, p in protocols},
         hota=HotaCounts.of_video(frames[""], shape),
-        j=math.fsum(np.nanmean(boundary.j, axis=1)),
-        f=math.fsum(np.nanmean(boundary.f, axis=1)),
-        objects=len(boundary.j),
+        j=math.fsum(np.nanmean(j, axis=1)),
+        f=math.fsum(np.nanmean(f, axis=1)),
+        objects=len(j),
         events=_event_table(events[""], table) if settings.events else np.empty((0, 5)),
     )
 
@@ -215,10 +249,12 @@ def _event_table(events: Events, table: _Table) -> Float64[np.ndarray, "N 5"]:
     return np.column_stack([events.frame, events.type, label, identity, events.distance])
 
 
-def _boundary_columns(boundary: BoundaryScores) -> dict[str, Float64[np.ndarray, " T"]]:
-    if not len(boundary.j):
+def _boundary_columns(boundary: BoundaryScores | None, n_frames: int) -> dict[str, Float64[np.ndarray, " T"]]:
+    """J and F per frame; NaN in frames before the first that is scored."""
+    if boundary is None or not len(boundary.j):
         return {}
-    j, f = boundary.j.mean(axis=0), boundary.f.mean(axis=0)
+    missing = np.full(n_frames - boundary.j.shape[1], np.nan)
+    j, f = (np.concatenate([missing, values.mean(axis=0)]) for values in (boundary.j, boundary.f))
     return {"j": j, "f": f, "jf": (j + f) / 2}
 
 

@@ -18,19 +18,24 @@ from __future__ import annotations
 import io
 import pickle
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from apex_lab.base import faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import replacing, unwritable
-from apex_lab.base.validation import one_line
+from apex_lab.base.machine import bounded_memory
+from apex_lab.base.validation import shown
 from apex_lab.config import components, trust
 from apex_lab.config.schema import Config, build_schedules
 from apex_lab.config.upgrades import FORMAT, upgraded
 from apex_lab.runs.outlines import outline
+from apex_lab.runs.record import LARGEST, Kept
 from apex_lab.scene import SceneModel
 
 _KEYS = {
@@ -106,15 +111,20 @@ def load(path: Path, trusted: bool = False, known: Iterable[str] = ()) -> dict[s
     Raises:
         UserError: missing, damaged, no checkpoint of ours, or one that names classes that are not allowed.
     """
-    content = _upgraded(_read(path, trusted, known, whole=True))
-    weights = content["inference"]["weights"]
-    strange = [name for name, weight in weights.items() if not isinstance(weight, torch.Tensor)]
-    if strange:
-        raise UserError(f"{path} is no apex_lab checkpoint (its weight {strange[0]} is no tensor): use another one.")
-    sick = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
-    if sick:
-        raise UserError(f"{path} holds weights that are not finite ({sick[0]}): its run diverged; use an earlier one.")
-    return content
+    with _reading(path):
+        content = _upgraded(_read(path, trusted, known, whole=True))
+        weights = content["inference"]["weights"]
+        strange = [name for name, weight in weights.items() if not isinstance(weight, torch.Tensor)]
+        if strange:
+            raise UserError(
+                f"{path} is no apex_lab checkpoint (its weight {strange[0]} is no tensor): use another one."
+            )
+        sick = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
+        if sick:
+            raise UserError(
+                f"{path} holds weights that are not finite ({sick[0]}): its run diverged; use an earlier one."
+            )
+        return content
 
 
 def glance(path: Path, trusted: bool = False) -> dict[str, Any]:
@@ -130,35 +140,48 @@ def glance(path: Path, trusted: bool = False) -> dict[str, Any]:
     Raises:
         UserError: as `load`, as far as it shows without the weights.
     """
-    content = _read(path, trusted, (), whole=False)
-    return {key: content[key] for key in ("step", "config", "choices")}
+    with _reading(path):
+        content = _read(path, trusted, (), whole=False)
+        return {key: content[key] for key in ("step", "config", "choices")}
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Inside, whatever a strange file makes the readers raise becomes a sentence, and memory is bounded.
+
+    Raises:
+        UserError: the sentence.
+    """
+    try:
+        with bounded_memory():
+            yield
+    except UserError:
+        raise
+    except Exception as error:  # what is raised for damaged bytes has no common class
+        raise UserError(f"{path} is damaged or no checkpoint ({type(error).__name__}): use another one.") from error
 
 
 def _read(path: Path, trusted: bool, known: Iterable[str], whole: bool) -> dict[str, Any]:
     """The content of a checkpoint of any format, with its configuration in today's; without tensors unless `whole`."""
     if not path.is_file():
         raise UserError(f"There is no checkpoint at {path}.")
-    try:
-        if not zipfile.is_zipfile(path):
-            raise UserError(
-                f"{path} is no checkpoint, or its end is missing: give a .ckpt file of a run, or the run's folder."
-            )
-        if whole:
-            with zipfile.ZipFile(path) as archive:
-                broken = archive.testzip()
-            if broken is not None:
-                raise UserError(f"{path} is damaged (checksum of {broken}): use another checkpoint.")
-        content = torch.load(path, map_location="cpu", weights_only=True) if whole else outline(path)
-    except UserError:
-        raise
-    except Exception as error:  # what is raised for damaged bytes has no common class
-        raise UserError(f"{path} is damaged or no checkpoint ({type(error).__name__}): use another one.") from error
+    if not zipfile.is_zipfile(path):
+        raise UserError(
+            f"{path} is no checkpoint, or its end is missing: give a .ckpt file of a run, or the run's folder."
+        )
+    with zipfile.ZipFile(path) as archive:
+        if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):  # it may inflate to anything
+            raise UserError(f"{path} is no apex_lab checkpoint (its parts are compressed): use another one.")
+        broken = archive.testzip() if whole else None
+    if broken is not None:
+        raise UserError(f"{path} is damaged (checksum of {broken}): use another checkpoint.")
+    content = torch.load(path, map_location="cpu", weights_only=True) if whole else outline(path)
     if not isinstance(content, dict) or "format" not in content or "weights" not in {**content, **_inside(content)}:
         raise UserError(f"{path} is no apex_lab checkpoint: give a .ckpt file of a run, or the run's folder.")
-    if content["format"] not in _KEYS:
+    if type(content["format"]) is not int or content["format"] not in _KEYS:
         raise UserError(
-            f"{path} has format {content['format']}, this version of apex_lab reads {', '.join(map(str, _KEYS))}: "
-            "use the version that wrote it."
+            f"{path} has format {shown(content['format'])}, this version of apex_lab reads "
+            f"{', '.join(map(str, _KEYS))}: use the version that wrote it."
         )
     if set(content) != _KEYS[content["format"]]:
         raise UserError(f"{path} is no apex_lab checkpoint: give a .ckpt file of a run, or the run's folder.")
@@ -167,8 +190,8 @@ def _read(path: Path, trusted: bool, known: Iterable[str], whole: bool) -> dict[
         raise UserError(f"{path} is no apex_lab checkpoint (its {missing} is none): use another one.")
     try:
         config = upgraded(content["config"], content["format"])
-    except (KeyError, TypeError, AttributeError) as error:
-        raise UserError(f"{path} holds no whole configuration ({one_line(error)}): use another one.") from error
+    except Exception as error:
+        raise UserError(f"{path} holds no whole configuration ({faults.cited(error)}): use another one.") from error
     if not trusted:
         trust.check({"config": config, "inference": {"model": _inside(content).get("model")}}, str(path), known)
     return {**content, "config": config}
@@ -179,20 +202,54 @@ def _inside(content: dict[str, Any]) -> dict[str, Any]:
     return inside if isinstance(inside, dict) else {}
 
 
-_OF_INFERENCE = {"model": dict, "weights": dict, "schedule": dict, "precision": object, "seed": int}
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", strict=True, arbitrary_types_allowed=True)
+
+
+class _Inference(_Part):
+    model: dict[str, Any]
+    weights: dict[str, Any]
+    schedule: dict[str, float]
+    precision: Literal[32, "bf16-mixed"]
+    seed: int = Field(ge=0, lt=LARGEST)
+
+
+class _Training(_Part):
+    optimizer: dict[str, Any]
+    callbacks: dict[str, Any] = {}
+    best: float | None = None
+    seconds: float = Field(default=0.0, ge=0.0, lt=1e12)
+    data_fingerprint: str | None = None
+    ended: bool = False
+    record: Kept = Kept()
+
+
+class _Content(_Part):
+    step: int = Field(ge=0, lt=LARGEST)
+    config: dict[str, Any]
+    choices: dict[str, str]
+    training: _Training | None
+
+
+class _Content1(_Content):
+    weights: dict[str, Any]
+
+
+class _Content2(_Content):
+    inference: _Inference
+
+
+_CONTENTS: dict[int, type[_Content]] = {1: _Content1, 2: _Content2}
+"""Format -> what must hold of its entries."""
 
 
 def _missing(content: dict[str, Any]) -> str | None:
     """The first entry that is not what it must be."""
-    kinds: dict[str, type] = {"config": dict, "choices": dict, "step": int}
-    for name, kind in kinds.items():
-        if not isinstance(content[name], kind):
-            return name
-    inside = _inside(content) if content["format"] > 1 else {"weights": content["weights"]}
-    for name, wanted in _OF_INFERENCE.items() if content["format"] > 1 else ():
-        if name not in inside or not isinstance(inside[name], wanted):
-            return f"inference.{name}"
-    return None if isinstance(inside["weights"], dict) else "weights"
+    try:
+        _CONTENTS[content["format"]].model_validate(content)
+    except ValidationError as error:
+        return ".".join(map(str, error.errors(include_url=False, include_input=False)[0]["loc"]))
+    return None
 
 
 def _upgraded(content: dict[str, Any]) -> dict[str, Any]:

@@ -24,14 +24,14 @@ from typing import Any, Literal
 import torch
 import yaml
 from filelock import FileLock, Timeout
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from apex_lab.base import console
 from apex_lab.base.errors import Busy, UserError
-from apex_lab.base.files import drafts, make_folder, read_json, set_aside, write_json, write_text
+from apex_lab.base.files import drafts, make_folder, read_json, set_aside, unwritable, write_json, write_text
 from apex_lab.config.schema import Job
 from apex_lab.config.upgrades import FORMAT, fingerprint
 from apex_lab.runs import identity, provenance
+from apex_lab.runs.record import read_record
 from apex_lab.runs.state import LOCK, RECORD, RESULTS, has_scores
 
 
@@ -51,26 +51,6 @@ Outcome = Literal["finished", "paused", "failed", "interrupted", "diverged", "pr
 
 KEPT = ("foreground_share", "history", "wandb_id")
 """Entries of the record that the checkpoint keeps too: what nothing else could bring back if run.json were lost."""
-
-
-class _Start(BaseModel):
-    """An entry of the record's history."""
-
-    started: str
-
-
-class _Record(BaseModel):
-    """What must hold of a record for a run to go on with it."""
-
-    model_config = ConfigDict(extra="ignore", strict=True)
-
-    status: str | None = None
-    seconds: float = 0.0
-    steps: int = 0
-    history: list[_Start] = []
-    data_fingerprint: str | None = None
-    foreground_share: float | None = None
-    wandb_id: str | None = None
 
 
 @dataclass
@@ -117,10 +97,8 @@ class Run:
     def _read(self) -> None:
         """Reads the record; a damaged one is set aside, since the checkpoint has what it held."""
         try:
-            record = read_json(self.record_file)
-            _Record.model_validate(record)
-            self.record = record
-        except (UserError, ValidationError):
+            self.record = read_record(self.record_file)
+        except UserError:
             aside = set_aside(self.record_file)
             console.warn(
                 f"{self.record_file} is damaged and was set aside as {aside.name}: "
@@ -164,7 +142,10 @@ class Run:
         make_folder(self.folder / "checkpoints")
         for place in (self.folder, *self._places()):
             for part in drafts(place):
-                part.unlink()  # left by a kill in the middle of writing
+                try:
+                    part.unlink()  # left by a kill in the middle of writing
+                except OSError as error:
+                    raise unwritable(part, error) from error
         self._lost = not self.record
         commit, dirty = provenance.commit()
         now, choices, config = _now(), self.job.choices, self.job.config

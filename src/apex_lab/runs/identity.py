@@ -15,9 +15,9 @@ from typing import Any
 import yaml
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import read_json
 from apex_lab.base.order import natural_key
 from apex_lab.config.upgrades import FORMAT, fingerprint, upgraded
+from apex_lab.runs.record import read_record
 from apex_lab.runs.state import RECORD
 
 NAMING = ("model", "ablation", "tuned", "data", "scale")
@@ -123,7 +123,7 @@ class Outputs:
     def _stored(self, folder: Path) -> list[str]:
         """The identities that a run folder may stand for; none where it cannot be recognised."""
         try:
-            record = read_json(folder / RECORD)
+            record = read_record(folder / RECORD)
         except UserError:
             record, formats = {}, list(range(1, FORMAT + 1))  # lost or damaged; the configuration still tells
         else:
@@ -146,7 +146,7 @@ def _upgraded_fingerprint(folder: Path, format: int) -> str | None:
     """The identity of a folder's configuration, read as one of a given format; None where it is not."""
     try:
         return fingerprint(upgraded(stored_configuration(folder), format))
-    except (OSError, yaml.YAMLError, KeyError, TypeError, AttributeError, ValueError):
+    except (OSError, yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError, RecursionError):
         return None
 
 

@@ -148,7 +148,7 @@ def _max_steps(state: RunState) -> int | None:
         return state.steps
     try:
         steps = stored_configuration(state.folder)["trainer"]["max_steps"]
-    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError):
+    except (OSError, ValueError, yaml.YAMLError, LookupError, TypeError, RecursionError):
         return None
     return steps if isinstance(steps, int) else None
 
@@ -187,7 +187,7 @@ def _last_row(curves: Path) -> tuple[int, float] | None:
     except OSError:
         return None
     step = rows[-1].partition(b",")[0] if rows else b""
-    return (int(step), when) if step.isdigit() else None
+    return (int(step), when) if step.isdigit() and len(step) < 19 else None
 
 
 def _when(record: Mapping[str, Any]) -> float:
@@ -204,7 +204,7 @@ def _seconds_since_epoch(text: object) -> float:
     """A time of a record; now where it has none."""
     try:
         return datetime.fromisoformat(str(text)).timestamp()
-    except ValueError:
+    except (ValueError, OverflowError, OSError):  # of a year that no clock has
         return time.time()
 
 

@@ -21,6 +21,7 @@ import msgspec
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.processes import alive
+from apex_lab.runs.record import read_record
 
 RECORD = "run.json"
 RESULTS = "metrics.json"
@@ -80,11 +81,9 @@ def read_state(folder: Path, split: str | None = None) -> RunState:
     if not file.is_file():
         return RunState(folder, "waiting", None, {})
     try:
-        record = read_json(file)
+        record = read_record(file)
     except UserError as error:
         return RunState(folder, "damaged", str(error), {})
-    if not isinstance(record, dict):
-        return RunState(folder, "damaged", f"{file} holds no record of a run.", {})
     state, reason = _state(folder, record, split)
     return RunState(folder, state, reason, record)
 
@@ -92,7 +91,8 @@ def read_state(folder: Path, split: str | None = None) -> RunState:
 class _Split(msgspec.Struct):
     """What every split of a whole metrics.json has; rows per video, nearly all of the file, are not even built."""
 
-    total: dict[str, Any]
+    total: dict[str, float | int | None]
+    terms: dict[str, float | int | None] | msgspec.UnsetType = msgspec.UNSET
 
 
 class _Results(msgspec.Struct):
@@ -114,6 +114,15 @@ def has_scores(folder: Path, split: str) -> bool:
     except (UserError, msgspec.MsgspecError, RecursionError):
         return False
     return split in splits
+
+
+def is_whole(scored: object) -> bool:
+    """Whether an entry of metrics.json's `splits` has scores, which are numbers or null."""
+    try:
+        msgspec.convert(scored, _Split)
+    except (msgspec.MsgspecError, RecursionError):
+        return False
+    return True
 
 
 def _has_end(file: Path) -> bool:

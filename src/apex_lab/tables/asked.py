@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json, write_text
-from apex_lab.base.validation import did_you_mean, shown, validate
+from apex_lab.base.validation import PathText, did_you_mean, shown, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import preflight
 from apex_lab.config.composition import CHOICES, composing, plain
@@ -48,7 +48,7 @@ class TablesConfig(BaseModel):
     published: bool
     yardsticks: bool
     arrangement_mean: Literal["scenario", "object"]
-    folder: str | None = Field(min_length=1)
+    folder: PathText | None
     dry_run: bool
 
 

@@ -17,6 +17,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.validation import sentence, shown, validate
 from apex_lab.metrics import KEYS
+from apex_lab.runs.record import read_record
 
 MIN_SHARE, MAX_SHARE = 0.001, 0.999
 """A seed has failed whose objects are given less or more of the validation pixels (metrics.md section 3)."""
@@ -169,7 +170,7 @@ def read_failures(run: SeedRun) -> dict[str, tuple[int, int, dict[str, int]]]:
 def _record(file: Path, seed: int, known: Mapping[str, Any] | None) -> Record:
     if not known and not file.is_file():
         raise UserError(f"{file} is missing: run the command of this run again.")
-    content = known or read_json(file)
+    content = known or read_record(file)
     try:
         record = validate(Record, content, "")
     except UserError as error:
@@ -257,6 +258,8 @@ def _scoring(scored: Mapping[str, Any], content: Mapping[str, Any]) -> str:
         scoring = {key: value for key, value in scoring.items() if key != "identities"}
     if isinstance(scoring, dict) and scoring.get("masks") == "model":  # what earlier versions did without saying so
         scoring = {key: value for key, value in scoring.items() if key != "masks"}
+    if isinstance(scoring, dict) and scoring.get("first_frame") == 0:  # likewise
+        scoring = {key: value for key, value in scoring.items() if key != "first_frame"}
     return json.dumps(scoring, sort_keys=True)
 
 

@@ -12,7 +12,7 @@ import torch
 import torch.distributed as dist
 from pydantic import Field
 
-from apex_lab.base import console, interrupts
+from apex_lab.base import console, faults, interrupts
 from apex_lab.base.errors import UserError
 from apex_lab.base.progress import Meter
 from apex_lab.runs import checkpoints
@@ -132,6 +132,14 @@ class Checkpoints(L.Callback):
         return states
 
 
+def not_restored(what: str, error: Exception) -> str:
+    """The sentence for a part of a checkpoint that does not fit what it is for."""
+    return (
+        f"The run's checkpoint does not fit its configuration ({what}: {faults.cited(error)}): "
+        "go back to the code that made it, or remove the run's folder to start again."
+    )
+
+
 class Lockstep(L.Callback):
     """What every rank does alike: takes back the states of callbacks, and agrees on the step to stop at.
 
@@ -150,7 +158,10 @@ class Lockstep(L.Callback):
     def setup(self, trainer: L.Trainer, learner: L.LightningModule, stage: str) -> None:
         for callback in _others(trainer, self):
             if callback.state_key in self._states:
-                callback.load_state_dict(self._states[callback.state_key])
+                try:
+                    callback.load_state_dict(self._states[callback.state_key])
+                except Exception as error:
+                    raise UserError(not_restored(f"the state of {callback.state_key}", error)) from error
 
     def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
         self._agree(trainer, learner)

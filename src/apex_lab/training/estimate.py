@@ -1,4 +1,4 @@
-"""How long training will take on a CPU, estimated before it starts."""
+"""What is tried before training starts: one frame, and on a CPU how long all of them will take."""
 
 from __future__ import annotations
 
@@ -7,9 +7,12 @@ import time
 
 import torch
 
+from apex_lab.base import faults
+from apex_lab.base.errors import UserError
+from apex_lab.base.machine import bounded_memory
 from apex_lab.base.progress import readable
 from apex_lab.config.schema import Config, build_clip_frames, build_schedules, build_weights
-from apex_lab.scene import SceneModel
+from apex_lab.scene import Context, Noise, SceneModel, schedule_at
 from apex_lab.training.update import WeightUpdate, named_parameters, remember_rates
 
 SMALL = 5e9
@@ -17,6 +20,34 @@ SMALL = 5e9
 
 LONG = 3 * 3600.0
 """Seconds above which there is a warning."""
+
+
+def try_out(config: Config, model: SceneModel) -> None:
+    """Sends one frame through a model, so that parts that do not fit each other are found before the data are made.
+
+    The model is left as it was. Nothing is tried where the size of the images is not known.
+
+    Raises:
+        UserError: it breaks.
+    """
+    size = config.data.get("image_size")
+    height, width = model.input_size or (size, size)
+    if model.needs_labels or not isinstance(height, int) or not isinstance(width, int):
+        return
+    schedule = schedule_at({name: each(0) for name, each in build_schedules(config).items()}, torch.device("cpu"))
+    trained = model.training
+    model.eval()
+    try:
+        with torch.random.fork_rng(devices=[]), torch.no_grad(), bounded_memory():
+            model(torch.full((1, 1, 3, height, width), 0.5), Context(schedule=schedule, noise=Noise()))
+    except UserError:
+        raise
+    except Exception as error:
+        raise UserError(
+            faults.told(error, f"model ({config.model['_target_']}) breaks at a frame of {height} x {width} pixels")
+        ) from error
+    finally:
+        model.train(trained)
 
 
 def warning(config: Config, model: SceneModel) -> str | None:

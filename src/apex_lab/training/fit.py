@@ -13,6 +13,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.strategies import DDPStrategy
 
+from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted
 from apex_lab.config.schema import (
     Config,
@@ -24,7 +25,7 @@ from apex_lab.config.schema import (
 )
 from apex_lab.data import VideoSource, training_loader, whole_loader
 from apex_lab.scene import SceneModel
-from apex_lab.training.callbacks import LastValidation, Lockstep
+from apex_lab.training.callbacks import LastValidation, Lockstep, not_restored
 from apex_lab.training.learner import Learner
 from apex_lab.training.ranks import Ranks
 from apex_lab.training.update import Mode, WeightUpdate
@@ -70,7 +71,10 @@ def fit(
     def optimizer(parameters: list[tuple[str, torch.nn.Parameter]]) -> torch.optim.Optimizer:
         built = build_optimizer(config, parameters)
         if training is not None:
-            built.load_state_dict(training["optimizer"])
+            try:
+                built.load_state_dict(training["optimizer"])
+            except Exception as error:
+                raise UserError(not_restored("the state of the optimizer", error)) from error
         return built
 
     update = WeightUpdate(

@@ -118,7 +118,7 @@ def _is_heading(columns: list[str]) -> bool:
 
 def _is_whole(row: dict[str | None, Any]) -> bool:
     """Whether a row has a number or nothing in each column; `csv` puts None where fields are missing or too many."""
-    if None in row or None in row.values() or not row["step"].isdecimal():
+    if None in row or None in row.values() or not re.fullmatch(r"\d{1,18}", row["step"], re.ASCII):
         return False
     try:
         for value in row.values():

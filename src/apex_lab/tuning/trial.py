@@ -16,6 +16,7 @@ from apex_lab.base import console
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import read_json
 from apex_lab.config.schema import Job
+from apex_lab.runs.state import is_whole
 from apex_lab.training.callbacks import Pruned
 from apex_lab.training.learner import Learner
 from apex_lab.tuning.settings import ELBO
@@ -130,8 +131,9 @@ def _when_free(train: Train, job: Job, callbacks: list[L.Callback], command: str
 def _final(job: Job, names: tuple[str, ...]) -> tuple[float, ...]:
     """The objectives of a finished run: final weights, all validation videos that its evaluation looks at."""
     file = trial_folder(job) / "metrics.json"
-    scored = read_json(file).get("splits", {}).get(SPLIT)
-    if not isinstance(scored, dict):
+    splits = read_json(file).get("splits")
+    scored = splits.get(SPLIT) if isinstance(splits, dict) else None
+    if not isinstance(scored, dict) or not is_whole(scored):
         raise UserError(f"{file} has no scores of the split '{SPLIT}': remove the run's folder and start again.")
     found = []
     for name in names:

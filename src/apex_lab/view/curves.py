@@ -114,7 +114,8 @@ def read_curves(curves_csv: Path) -> pd.DataFrame:
         raise UserError(f"{curves_csv} cannot be read ({str(error).strip()}): restore or delete it") from error
     if STEP not in table:
         raise UserError(f"{curves_csv} has no column {STEP!r}: it is no table of curves")
-    table = table.apply(pd.to_numeric, errors="coerce").dropna(subset=[STEP])
+    table = table.apply(pd.to_numeric, errors="coerce")
+    table = table[np.isfinite(table[STEP].astype(float))]
     # quantities of one step may stand in several rows, and a run that was resumed may have made a step twice
     table = table.groupby(STEP).last().drop(columns=list(_IGNORED), errors="ignore")
     table = table.replace([np.inf, -np.inf], np.nan).dropna(axis="columns", how="all")

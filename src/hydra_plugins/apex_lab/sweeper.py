@@ -5,6 +5,7 @@ so this module imports nothing of apex_lab. Hydra's way of importing it forbids 
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
@@ -51,6 +52,7 @@ class JobSweeper(Sweeper):
         """Takes what Hydra has composed; the launcher is built here, so that a faulty one fails before any work."""
         self._task = task_function
         self._folder = str(config.hydra.sweep.dir)
+        Path(self._folder).mkdir(parents=True, exist_ok=True)  # launchers would fail job by job
         self._basic = str(config.hydra.launcher._target_).endswith(".BasicLauncher")
         self._launcher = Plugins.instance().instantiate_launcher(
             hydra_context=hydra_context, task_function=task_function, config=config

@@ -55,6 +55,7 @@ class Background(nn.Module):
             )
         self.change = change
         layers: list[nn.Module] = [conv_norm(4, width, kernel=5, stride=4)]
+        self.image_size = image_size
         side = image_size // 4
         while side > 4:
             layers.append(conv_norm(width, width, stride=2))

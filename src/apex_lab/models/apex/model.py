@@ -114,6 +114,10 @@ class Apex(SceneModel):
             raise ValueError(
                 f"model.image_size={image_size} must be a multiple of 32, its quarter one of model.grid={grid}"
             )
+        if background.image_size != image_size:
+            raise ValueError(
+                f"model.background.image_size={background.image_size} must be that of the model, {image_size}"
+            )
         self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
         self.input_size = (image_size, image_size)
         self.render_top = min(render_top or grid**2, grid**2)
