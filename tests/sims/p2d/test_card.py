@@ -83,7 +83,7 @@ def test_page_has_every_part_and_no_gap(root: Path, tmp_path: Path, capsys: pyte
     for name in re.findall(r"\]\(([^)]+)\)", text):
         with Image.open(tmp_path / name) as picture:
             assert min(picture.size) > 300
-    for name in read_manifest(root).classes:
+    for name in read_manifest(root).facts["classes"]:
         assert f"| {name} |" in text
     assert "| 0.28 |" in text
     assert "| 0.06 |" in text
