@@ -88,7 +88,7 @@ def write_video(path: Path, video: np.ndarray) -> None:
     Raises:
         SimError: OpenCV cannot write there.
     """
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), FRAMES_PER_S, video.shape[2:0:-1])
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_S, video.shape[2:0:-1])
     if not writer.isOpened():
         raise SimError(f"{path} cannot be written: choose another folder")
     for frame in video:

@@ -19,7 +19,7 @@ from sims.p2d.store import KIND, SPLITS, read_manifest
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command; returns the exit code: 0 done, 1 failed or damage found, 2 wrong settings, 130 Ctrl-C, 143 SIGTERM."""
+    """Runs one command; returns the exit code: 0 done, 1 failed or damage, 2 wrong settings, 128 + n: signal n."""
     options = _parser().parse_args(arguments)
     try:
         with _terminable():

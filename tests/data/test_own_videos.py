@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,7 +20,7 @@ from apex_lab.data.own_videos.__main__ import main as command_line
 from apex_lab.data.own_videos.cutting import SPLITS, Cut
 from apex_lab.data.own_videos.maker import Stream
 from recordings import MANIFEST
-from tests.conftest import Ended
+from tests.conftest import REPOSITORY, Ended
 from tests.fakes.own_videos import frame, write_pictures, write_video
 
 SMALL = {"frames": 3, "image_size": 16, "train": 100, "val": 100, "test": 100, "prepare_workers": 0, "workers": 0}
@@ -274,3 +275,16 @@ def test_training_without_labels_says_what_needs_them(tmp_path: Path, videos: Pa
     refused = command("train", "model=oracle", "scale=smoke", "data=video", path)
     assert refused.code != 0
     assert "needs labels" in refused.err
+    stop = "{_target_: lightning.pytorch.callbacks.EarlyStopping, monitor: val/ari_fg, mode: max}"
+    refused = command("train", *words, path, f"+callbacks.stop={stop}")
+    assert refused.code != 0
+    assert "callbacks.stop.monitor = val/ari_fg needs labels" in refused.err
+
+
+def test_the_experiment_is_apex_at_cpu_scale_on_own_videos(command: Callable[..., Ended]):
+    shown = yaml.safe_load(command("train", "+experiment=own_video", "data.path=x", "--cfg", "job", "--resolve").out)
+    assert shown["data"]["_target_"] == "apex_lab.data.OwnVideosSource"
+    assert (shown["data"]["frames"], shown["data"]["image_size"], shown["data"]["stride"]) == (8, 64, 3)
+    recipe = yaml.safe_load((REPOSITORY / "conf" / "recipe" / "apex" / "cpu.yaml").read_text())
+    assert shown["trainer"]["max_steps"] == recipe["trainer"]["max_steps"]
+    assert (shown["trainer"]["monitor"], shown["trainer"]["monitor_mode"]) == ("val/loss", "min")
