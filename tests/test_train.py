@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -138,7 +139,10 @@ def test_an_unexpected_error_is_recorded(
     monkeypatch.setenv("TINY_BROKEN_AT", "3")
     ended = train()
     assert ended.code == 1
-    assert "Traceback" in ended.err
+    [line] = ended.err.splitlines()
+    found = re.fullmatch(r"RuntimeError: the data broke at step 3 \(traceback: (.+)\)\.", line)
+    assert found is not None, line
+    assert "Traceback" in Path(found.group(1)).read_text()
     assert record(the_run())["status"] == "failed"
     assert record(the_run())["reason"] == "RuntimeError: the data broke at step 3"
     assert "the data broke" in (the_run() / "log.txt").read_text()

@@ -69,6 +69,32 @@ REFUSED = {
     "scale=cpu": "model=tiny has no recipe conf/recipe/tiny/cpu.yaml",
     "data.batch_size=4": "Unknown key data.batch_size = 4",
     "loss.error=-1": "loss.error is -1 at step 0: it must be at least 0.",
+    "model=null": "model=null names no choice of model: write one of apex, background_subtraction,",
+    "+ablation=3": "+ablation=3 names no choice of ablation: write one of gaussian,",
+    "trainer=[]": "trainer",
+    "~model": "~model leaves no model, and every run has one: choose it by model=...",
+    "model=tiny.yaml": "model=tiny.yaml is no name of a choice: write model=tiny.",
+    "model=../model/tiny": "model=../model/tiny is no name of a choice: write model=tiny.",
+    "model.width=10000000000": "model (tests.tiny.Layers) asks for 1,080.0 GB at once, and",
+    "model.width=1000000000": "model: its weights take more than the",
+    "data.frames=10000000": "clips.batch_size = 2, data.frames = 10000000, data.image_size = 32: a batch of",
+    "trainer.max_steps=1000000000000000000000000000000": "trainer.max_steps = a whole number of 100 bits is wrong",
+    "+callbacks.x={_target_: builtins.print}": "callbacks.x._target_ = 'builtins.print' is no Callback of Lightning",
+    "+logger.x={_target_: tests.tiny.Layers}": "logger.x._target_ = 'tests.tiny.Layers' is no Logger of Lightning",
+    "loss.error={_target_: os.getcwd}": "loss.error is not a schedule: choose one of apex_lab.training.schedules.",
+    "loss.error=1e308": "loss.error is 1e+308 at step 0: it must be between 0 and 3.40282e+38.",
+    "lr_scale=1e308": "lr_scale is 1e+308 at step 0: it must be between 0 and 1e+09.",
+    "optimizer.lr=1e308": "optimizer: a learning rate of 1e+308 is wrong: it is at most 1e+09.",
+    "optimizer={_target_: torch.optim.SparseAdam}": "cannot update this model's weights: RuntimeError: Sparse",
+    "optimizer={_target_: torch.optim.SGD, eps: 1}": "Unknown key optimizer.eps = 1",
+    "paths.outputs=": "paths.outputs = '' is wrong: it is empty, as an unset variable is: give a path.",
+    f"paths.outputs=/{'x' * 5000}": "paths.outputs = '/xxx",
+    "--resolve": "--resolve goes with --cfg alone: write --cfg job --resolve.",
+    "--package=x": "--package goes with --cfg alone",
+    "--experimental-rerun=x": "--experimental-rerun is not read here: the command of a run, typed again, resumes it.",
+    "--cfg=nix": "Argument --cfg/-c: invalid choice: 'nix'",
+    "--nix": "Unrecognized arguments: --nix.",
+    "hydra.run.dir=/proc/x": "/proc/x: No such file or directory (traceback: ",
     "words": "'words' cannot be read as key=value",
     "x=[1": "'x=[1' cannot be read as key=value",
 }
@@ -96,6 +122,12 @@ def test_every_job_of_a_sweep_is_checked_before_the_first_starts(train: Callable
     ("words", "told"),
     [
         (
+            "hydra.launcher._target_=nix",
+            "hydra.launcher._target_=nix is no launcher of Hydra: choose one by hydra/launcher=...",
+        ),
+        ("hydra.sweep.dir=/proc/x", "/proc/x: No such file or directory"),
+        ("hydra.sweeper.max_batch_size=0", "Unknown key hydra.sweeper.max_batch_size=0."),
+        (
             "hydra.sweeper.slots=0",
             "hydra.sweeper.slots=0: give the number of jobs that a machine does at once, or null.",
         ),
@@ -106,6 +138,58 @@ def test_every_job_of_a_sweep_is_checked_before_the_first_starts(train: Callable
 )
 def test_launchers_that_cannot_be(words: str, told: str, train: Callable[..., Ended], tmp_path: Path) -> None:
     refused(train("seed=0,1", words, "-m"), told, tmp_path)
+
+
+def test_choices_that_a_pattern_names(train: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(train("+ablation=glob(no_*)", "seed=x", "-m"), "seed = 'x' is wrong", tmp_path)
+    refused(train("+ablation=glob(x*)", "-m"), "+ablation=glob(x*) fits no choice of ablation.", tmp_path)
+    refused(train("model=glob(tin*)", "seed=x", "-m"), "seed = 'x' is wrong", tmp_path)  # in the folder of --config-dir
+
+
+def test_a_key_that_only_swept_models_have(command: Callable[..., Ended], tmp_path: Path) -> None:
+    words = ("model=background_subtraction,color_clusters", "model.min_area=0.004", "data=sprites", "scale=smoke")
+    ended = command("train", *words, "evaluation.pictures=0", "-m")
+    assert ended.code == 0, ended.err
+    assert len(list(tmp_path.glob("outputs/*/seed_0/metrics.json"))) == 2
+
+
+def test_a_sweep_in_an_experiment_is_checked_first(command: Callable[..., Ended], tmp_path: Path) -> None:
+    folder = tmp_path.parent / f"{tmp_path.name}_conf"
+    for file in (REPOSITORY / "tests" / "conf").rglob("*.yaml"):
+        place = folder / file.relative_to(REPOSITORY / "tests" / "conf")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_bytes(file.read_bytes())
+    (folder / "experiment").mkdir()
+    text = "# @package _global_\nhydra:\n  mode: MULTIRUN\n  sweeper:\n    params:\n      seed: 0,x\n"
+    (folder / "experiment" / "swept.yaml").write_text(text)
+    words = ("--config-dir", str(folder), *TINY[2:], "+experiment=swept")
+    for further in ((), ("-m",)):
+        refused(command("train", *words, *further), "seed = 'x' is wrong", tmp_path)
+
+
+def test_home_folders_are_written_out(
+    train: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "my home"))
+    for word in ("paths.outputs=~/runs", "paths.outputs='~/runs'", 'paths.outputs="~/runs"'):
+        ended = train(word, "--cfg", "job", "--package", "paths")
+        assert f"outputs: {tmp_path / 'my home'}/runs" in ended.out, ended.err
+
+
+def test_what_is_merged_is_told(train: Callable[..., Ended], tmp_path: Path) -> None:
+    told = "optimizer={...} is merged into what the files set there, optimizer."
+    refused(train("++optimizer.muon_lr=0.1", "optimizer={_target_: torch.optim.SGD}"), told, tmp_path)
+
+
+def test_an_ablation_of_another_model_is_named(command: Callable[..., Ended], tmp_path: Path) -> None:
+    told = "+ablation=no_entropy sets loss.mask_entropy, which model=oracle does not have: leave out the ablation"
+    refused(command("train", "model=oracle", "data=sprites", "scale=smoke", "+ablation=no_entropy"), told, tmp_path)
+
+
+def test_a_path_that_needs_quotes(command: Callable[..., Ended], tmp_path: Path) -> None:
+    told = """quote it for Hydra too: 'checkpoint="odd/epoch=9-step=350.ckpt"')."""
+    refused(command("evaluate", "checkpoint=odd/epoch=9-step=350.ckpt"), told, tmp_path)
+    refused(command("evaluate", "checkpoint="), "checkpoint = '' is wrong: it is empty, as an unset variable", tmp_path)
 
 
 def test_two_ablations_of_one_run(train: Callable[..., Ended], tmp_path: Path) -> None:
@@ -119,6 +203,13 @@ APEX = ("model=apex", "data=p2d", "scale=smoke")
 @pytest.mark.parametrize(
     ("word", "told"),
     [
+        ("model.hidden=1000000", "model (apex_lab.models.apex.Apex) asks for 12,000.1 GB at once, and"),
+        (
+            "model.start_mask=1e308",
+            "RuntimeError: value cannot be converted to type float without overflow (trace",
+        ),
+        ("model.encoder.depths=[100,100,100,100]", "model.encoder: it has more than 20,000 parts"),
+        ("model.background.image_size=64", "model.background.image_size=64 must be that of the model, 32."),
         ("model.image_size=48", "model.image_size=48 must be a multiple of 32, its quarter one of model.grid=4"),
         ("schedule.temperature.end=0", "schedule.temperature is 0 at step"),
         ("++schedule.carry.end=2", "schedule.carry is 2 at step 0: it must be between 0 and 1."),

@@ -10,7 +10,7 @@ from pandas.testing import assert_frame_equal
 
 from apex_lab.metrics import KEYS, Evaluator, EvaluatorSettings, TrackingSettings
 from apex_lab.metrics import bench_scoring as bench
-from apex_lab.metrics.keys import keys
+from apex_lab.metrics.keys import FRAME_SCORES, VIDEO_SCORES, keys
 from apex_lab.metrics.tracking import EVENT_TYPES
 
 EVERYTHING = EvaluatorSettings(per_frame=True, events=True)
@@ -147,6 +147,33 @@ def test_skip_empty(videos) -> None:
     assert plain["msc_fg"] == pytest.approx(skipping["msc_fg"] * (1 - share))
     assert plain["ari_fg"] == pytest.approx(skipping["ari_fg"] * (1 - share) + share)
     assert plain["msc"] == skipping["msc"]
+
+
+@pytest.mark.parametrize("identities", ["own", "none", "linked"])
+def test_segmentation_from_a_frame_on_is_that_of_the_rest_of_the_video(make, identities: str) -> None:
+    videos = make.some_videos(3)
+    later = EvaluatorSettings(first_frame=3, identities=identities, per_frame=True)
+    found = evaluate(videos, later).result()
+    whole = evaluate(videos, EvaluatorSettings(identities=identities, per_frame=True)).result()
+    rest = {name: (prediction[3:], truth[3:]) for name, (prediction, truth) in videos.items()}
+    cut = evaluate(rest, EvaluatorSettings(identities=identities, per_frame=True)).result()
+    segmentation = [*FRAME_SCORES, *VIDEO_SCORES, "j", "f", "jf"]
+    for name, value in found["total"].items():
+        # identities that are linked from the first frame on may differ from those linked later, not their overlaps
+        expected = cut if name in segmentation and (identities != "linked" or name in FRAME_SCORES) else whole
+        if identities != "linked" or name not in (*VIDEO_SCORES, "j", "f", "jf"):
+            assert value == pytest.approx(expected["total"][name], nan_ok=True), name
+    rows = [row for row in found["per_frame"] if row["frame"] >= 3]
+    assert [row["ari"] for row in rows] == [row["ari"] for row in cut["per_frame"]]
+    assert all(math.isnan(row["ari"]) for row in found["per_frame"] if row["frame"] < 3)
+
+
+def test_a_video_that_ends_before_the_first_frame_has_no_segmentation(make) -> None:
+    total = evaluate(make.some_videos(2), EvaluatorSettings(first_frame=99)).result()["total"]
+    assert all(math.isnan(total[name]) for name in ("ari", "video_ari", "j", "f"))
+    assert total["num_frames"] > 0
+    with pytest.raises(ValueError, match="first_frame is -1; frames are counted from 0"):
+        EvaluatorSettings(first_frame=-1)
 
 
 def test_settings_are_stored(make) -> None:

@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TextIO
+from typing import Any
 
 from apex_lab.base.files import unwritable
 
@@ -123,7 +123,7 @@ def _close_gap(number: int) -> None:
             os.close(nowhere)
 
 
-def _printable(text: str, stream: TextIO) -> str:
+def _printable(text: str, stream: Any) -> str:
     """The text with a question mark in place of what the stream cannot take."""
     encoding = getattr(stream, "encoding", None) or "utf-8"
     try:
@@ -132,7 +132,7 @@ def _printable(text: str, stream: TextIO) -> str:
         return text.encode("ascii", "replace").decode()
 
 
-def _silence(stream: TextIO) -> None:
+def _silence(stream: Any) -> None:
     """Leads a stream nowhere, so that neither we nor a library at the end of the process write into it again."""
     with contextlib.suppress(OSError, ValueError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
