@@ -15,7 +15,7 @@ from apex_lab.training import schedules as training_schedules_slot_attention
 
 CONF = Path(__file__).parents[3] / "conf"
 SIDES = {"paper": 128, "cpu": 64, "quickstart": 64, "smoke": 32}
-INPUTS = {**SIDES, "cpu": 24}
+INPUTS = {**SIDES, "cpu": 32}
 """What the model sees: at scale=cpu a recipe of its own shrinks the images."""
 
 
