@@ -56,10 +56,10 @@ def _filled(template: Any, rest: Iterator[Leaf], device: torch.device) -> Any:
             raise ValueError(f"{type(value).__name__} in place of a tensor")
         return value.numpy() if isinstance(template, np.ndarray) else value.to(device)
     if template is None or isinstance(template, (bool, int, float, str)):
-        value = next(rest, _END)
-        if type(value) is not type(template):
-            raise ValueError(f"{type(value).__name__} in place of {type(template).__name__}")
-        return value
+        plain: Any = next(rest, _END)
+        if type(plain) is not type(template):
+            raise ValueError(f"{type(plain).__name__} in place of {type(template).__name__}")
+        return plain
     children = [_filled(child, rest, device) for child in _children(template)]
     if isinstance(template, dict):
         return dict(zip(template, children, strict=True))

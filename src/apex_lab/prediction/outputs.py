@@ -12,6 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -109,7 +110,7 @@ class Rle(Output):
             def add(predicted: Predicted) -> None:
                 for seen in _visible(predicted):
                     (code,) = encode((predicted.index == seen.index)[None])
-                    entry = {"image_id": predicted.number, "category_id": 1, "track_id": seen.id}
+                    entry: dict[str, Any] = {"image_id": predicted.number, "category_id": 1, "track_id": seen.id}
                     entry |= {"segmentation": code, "score": round(seen.presence, 4)}
                     file.write(json.dumps(entry) + "\n")
 

@@ -133,8 +133,9 @@ def _paint(labels: Int64[np.ndarray, "T H W"]) -> UInt8[np.ndarray, "T H W 3"]:
 
 
 def _page(name: str, rows: Sequence[tuple[str, str, np.ndarray]], times: Sequence[int]) -> Image.Image:
-    height, width = cell_size(*rows[0][2].shape[1:3], CELL)
-    tops = []
+    _, frame_height, frame_width, _ = rows[0][2].shape
+    height, width = cell_size(frame_height, frame_width, CELL)
+    tops: list[int] = []
     top = MARGIN + _CAPTION + _TIMES
     for group, _, _ in rows:
         top += _GROUP if group and tops else 0

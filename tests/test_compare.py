@@ -1,0 +1,60 @@
+"""`python -m apex_lab.compare`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from tests.conftest import REPOSITORY, Ended
+
+EXAMPLE = REPOSITORY / "examples" / "pushing.mp4"
+
+
+def test_models_on_the_clips_of_the_first_one_s_data(
+    command: Callable[..., Ended], trained: Path, tmp_path: Path
+) -> None:
+    # the shipped weights know another size than the data's
+    ended = command("compare", f"checkpoints=[{trained},apex-p2d-cpu]", "trust=true", "clips=2", "folder=cmp")
+    assert (ended.code, ended.err) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "cmp").iterdir()) == ["test_00000.png", "test_00001.png"]
+    assert ended.out.splitlines() == ["cmp/test_00000.png", "cmp/test_00001.png", "2 models on 2 clips"]
+    height = Image.open(tmp_path / "cmp" / "test_00000.png").height
+    assert height == 12 + 30 + 22 + 6 * 128 + 5 * 4 + 3 * 10 + 12  # input, truth, two rows for each model
+
+
+def test_models_on_own_videos(command: Callable[..., Ended], tmp_path: Path) -> None:
+    words = ("checkpoints=apex-p2d-cpu", f"video={EXAMPLE}", "frames=3", "every=2", "folder=cmp")
+    assert command("compare", *words).code == 0
+    assert Image.open(tmp_path / "cmp" / "pushing.png").height == 12 + 30 + 22 + 3 * 128 + 2 * 4 + 10 + 12
+    ended = command("compare", *words, "start=100")
+    assert (ended.code, ended.err) == (1, f"{EXAMPLE} has no frame 100: give a smaller start.\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "checkpoints is missing: write 'checkpoints=[a.ckpt, outputs/<run>/seed_0]'."),
+        (("checkpoints=[none.ckpt]",), "checkpoint = none.ckpt does not exist: give a .ckpt file or a run folder."),
+        (("checkpoints=apex-p2d-cpu", "frames=3"), "frames = 3 goes with video=... alone: leave it out."),
+        (
+            ("checkpoints=apex-p2d-cpu", "names=[a,b]"),
+            "names holds 2 captions for 1 checkpoints: give one for each.",
+        ),
+        (
+            ("checkpoints=apex-p2d-cpu", f"video={EXAMPLE}", "data=sprites"),
+            "video and data are both given: compare on one after the other.",
+        ),
+        (
+            ("checkpoints=apex-p2d-cpu", "model=space"),
+            "model=space is for training: a checkpoint brings its own configuration; leave it out.",
+        ),
+    ],
+)
+def test_wrong_commands_are_refused_in_one_sentence(
+    command: Callable[..., Ended], words: tuple[str, ...], said: str
+) -> None:
+    ended = command("compare", *words)
+    assert (ended.code, ended.err) == (2, said + "\n")
