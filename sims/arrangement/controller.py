@@ -335,7 +335,7 @@ class Controller:
         self.current = None
 
 
-def _is_free(body: Body, target: Body, others: list[Body]) -> bool:
+def _is_free(body: Body, target: Body, others: Sequence[Body]) -> bool:
     """Whether an object would stand apart from all others at its target, turned as there or as it is."""
     there = replace(body, centre=target.centre, yaw=target.yaw)
     return all(separate(there.outline, other.outline, CLEAR_M) for other in others)
