@@ -5,8 +5,7 @@ It knows what perception finds in images without the arm, and its own arm; nothi
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
