@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import importlib
 import importlib.metadata
-from collections.abc import Callable
+import os
+import sys
+from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
 from typing import Any
 
@@ -22,11 +26,32 @@ def load_pybullet() -> Any:
         SimError: PyBullet is not installed.
     """
     try:
-        return importlib.import_module("pybullet")
+        if "pybullet" in sys.modules:
+            return sys.modules["pybullet"]
+        with _no_output():
+            return importlib.import_module("pybullet")
     except ImportError as error:
         raise SimError(
             f"PyBullet is not installed: {INSTALL}; training on data that is already made needs no simulator."
         ) from error
+
+
+@contextlib.contextmanager
+def _no_output() -> Iterator[None]:
+    """Drops what C code prints: PyBullet prints when it was built, among the results of commands that others read."""
+    try:
+        kept = os.dup(1)
+    except OSError:  # standard output is closed
+        yield
+        return
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+        try:
+            yield
+        finally:
+            ctypes.CDLL(None).fflush(None)  # else it would be printed when the process ends
+            os.dup2(kept, 1)
+            os.close(kept)
 
 
 @lru_cache(maxsize=1)
