@@ -112,7 +112,8 @@ class Controller:
             self.scene = self.look()
             self.matches = self._match(self.scene)
             self._verify(self.scene)
-            if not self.matches and not self.finished:
+            if not self.matches:
+                self._close()
                 return "nothing detected"
             if all(self.states[goal].done for _, goal in self.matches):
                 self._close()

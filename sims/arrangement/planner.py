@@ -19,7 +19,9 @@ from sims.bullet import Client
 
 IK_CALLS, IK_ERROR_M, IK_ERROR_RAD = 8, 5e-4, 5e-3
 CLEAR_M = 0.004
-"""Minimum distance of the arm and of what it holds from every body."""
+"""Minimum distance of the arm from every body."""
+HELD_CLEAR_M = 0.0005
+"""Minimum distance of what it holds: a body may have stood close to another before it was lifted."""
 TABLE_CLEAR_M = 0.002
 GROWN_M = 0.004
 """Boxes are this much wider than what the camera saw, on all sides."""
@@ -148,7 +150,7 @@ class Planner:
         shift, turn = self._held_at
         place = point + _turn(yaw) @ shift
         call("resetBasePositionAndOrientation", self.held, place.tolist(), _quaternion(yaw + turn))
-        return not any(call("getClosestPoints", self.held, box, CLEAR_M) for box in self.boxes)
+        return not any(call("getClosestPoints", self.held, box, HELD_CLEAR_M) for box in self.boxes)
 
     def _pose(self, angles: np.ndarray, fingers: float = OPEN_M) -> None:
         for joint, angle in zip(panda.JOINTS, [*angles.tolist(), fingers, fingers], strict=True):

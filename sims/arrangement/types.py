@@ -37,8 +37,8 @@ out of time: the episode's time was spent.
 """
 
 Ended = Literal["arranged", "nothing detected", "stuck", "out of time"]
-"""How an episode ended: no object left to move; no pair of a current and a goal detection; no possible sub-task left;
-simulated time spent."""
+"""How an episode ended: every object that has a match is at its goal; there is, or was left, no pair of a current and a
+goal detection; no possible sub-task was left; simulated time was spent."""
 
 
 @dataclass(frozen=True)
