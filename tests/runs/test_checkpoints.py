@@ -157,7 +157,7 @@ def test_a_glance_reads_the_plain_values_alone_and_calls_nothing(tmp_path: Path)
         def __reduce__(self) -> tuple[Any, ...]:
             return os.system, (f"touch {proof}",)
 
-    torch.save({"format": FORMAT, **content(), "choices": {"model": Hostile()}}, path)
+    torch.save({"format": FORMAT, **content(), "config": {"seed": 0, "x": Hostile()}}, path)
     checkpoints.glance(path)
     assert not proof.exists()
     with pytest.raises(UserError, match=r"is damaged or no checkpoint \(UnpicklingError\)"):

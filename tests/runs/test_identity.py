@@ -91,8 +91,8 @@ def test_folders_are_listed_once_however_many_runs_are_missing(tmp_path: Path, m
     for number in range(20):
         record(tmp_path / f"m_d_s_{number:08x}" / "seed_0", format=2, fingerprint=f"{number:064x}")
     reads: list[Path] = []
-    read_json = identity.read_json
-    monkeypatch.setattr(identity, "read_json", lambda path: (reads.append(path), read_json(path))[1])
+    read_record = identity.read_record
+    monkeypatch.setattr(identity, "read_record", lambda path: (reads.append(path), read_record(path))[1])
     outputs = Outputs(tmp_path)
     for value in range(50):
         run_folder(raw(tmp_path, value=value), CHOICES, outputs)
