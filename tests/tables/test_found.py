@@ -147,9 +147,9 @@ TOTAL = ("splits", "test", "total")
     ("name", "keys", "value", "told"),
     [
         ("run.json", ("status",), "done", "run.json: status = 'done' is wrong"),
-        ("run.json", ("seed",), "0", "run.json: seed = '0' is wrong"),
+        ("run.json", ("seed",), "0", "run.json is damaged: seed = '0' is wrong"),
         ("run.json", ("seed",), 5, "run.json is of seed 5, but its folder is seed_0"),
-        ("run.json", ("foreground_share",), "much", "run.json: foreground_share = 'much' is wrong"),
+        ("run.json", ("foreground_share",), "much", "run.json is damaged: foreground_share = 'much' is wrong"),
         ("metrics.json", ("splits",), [], "metrics.json has no 'splits'"),
         ("metrics.json", ("splits",), {"val": {}}, "metrics.json has no scores of the split 'test' (it has val)"),
         ("metrics.json", TOTAL, 3, "metrics.json has no 'splits.test.total'"),

@@ -20,7 +20,13 @@ INPUTS = {**SIDES, "cpu": 32}
 
 
 def composed(scale: str, *words: str) -> Any:
-    chosen = ["+model=slot_attention", f"+recipe=slot_attention/{scale}", f"+data.image_size={SIDES[scale]}", *words]
+    chosen = [
+        "+model=slot_attention",
+        f"+recipe=slot_attention/{scale}",
+        "+data=sprites",
+        f"data.image_size={SIDES[scale]}",
+        *words,
+    ]
     with initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
         return OmegaConf.to_container(compose(overrides=chosen), resolve=True)
 
