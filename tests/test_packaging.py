@@ -25,11 +25,16 @@ def test_the_wheel_holds_code_and_configuration_and_no_tests(wheel: Path) -> Non
     for path in (REPOSITORY / "conf").rglob("*.yaml"):
         assert f"apex_lab/{path.relative_to(REPOSITORY)}" in names
     assert "apex_lab/conf/recipe/apex/paper.yaml" in names
-    for folder in ("src/apex_lab", "src/hydra_plugins", "sims"):
+    for folder in ("src/apex_lab", "src/hydra_plugins", "sims", "recordings"):
         for path in (REPOSITORY / folder).rglob("*.py"):
             assert str(path.relative_to(REPOSITORY)).removeprefix("src/") in names
     tops = {name.split("/")[0] for name in names}
-    assert {top for top in tops if not top.endswith(".dist-info")} == {"apex_lab", "hydra_plugins", "sims"}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {
+        "apex_lab",
+        "hydra_plugins",
+        "recordings",
+        "sims",
+    }
     # naive twins are an oracle of the tests and a baseline of the benchmark, both in the repository alone
     twins = {path.name for path in (REPOSITORY / "tests" / "reference").glob("*.py")}
     assert "apex.py" in twins

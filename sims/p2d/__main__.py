@@ -3,33 +3,59 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+from recordings import MANIFEST, read_journal, verify
 from sims.errors import SimError
 from sims.p2d.generate import generate, repair
-from sims.p2d.manifest import MANIFEST, read_journal, read_manifest
 from sims.p2d.settings import Settings
 from sims.p2d.settings_text import SettingsError, settings_from
-from sims.p2d.store import SPLITS, total_bytes
-from sims.p2d.verify import verify
+from sims.p2d.store import KIND, SPLITS, read_manifest
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command; returns the exit code: 0 done, 1 failed or damage found, 2 wrong settings, 130 interrupted."""
+    """Runs one command; returns the exit code: 0 done, 1 failed or damage, 2 wrong settings, 128 + n: signal n."""
     options = _parser().parse_args(arguments)
     try:
-        code: int = options.run(options)
+        with _terminable():
+            code: int = options.run(options)
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
     except SimError as error:
         print(error, file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("interrupted; finished trajectories are kept, run the same command to resume", file=sys.stderr)
-        return 130
+    except KeyboardInterrupt as stop:
+        what = "terminated" if isinstance(stop, _Terminated) else "interrupted"
+        print(f"{what}; finished trajectories are kept, run the same command to resume", file=sys.stderr)
+        return 143 if isinstance(stop, _Terminated) else 130
     return code
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM came."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Ends the work in order on SIGTERM too, as a scheduler sends it."""
+
+    def stop(*_: object) -> None:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _make(options: argparse.Namespace) -> int:
@@ -39,8 +65,8 @@ def _make(options: argparse.Namespace) -> int:
     if not options.no_card and not (root / "card" / "README.md").exists():
         _card(argparse.Namespace(dir=root, out=None))
     made = ", ".join(f"{getattr(settings, split)} {split}" for split in SPLITS)
-    redrawn = sum(record.redraws for record in manifest.records.values())
-    print(f"{root}: {made} trajectories, {total_bytes(settings) / 1e9:.2f} GB, {redrawn} attempts redrawn")
+    redrawn = sum(record.notes["redraws"] for record in manifest.records.values())
+    print(f"{root}: {made} trajectories, {manifest.layout.total_bytes() / 1e9:.2f} GB, {redrawn} attempts redrawn")
     return 0
 
 
@@ -48,8 +74,8 @@ def _begun(root: Path) -> Settings | None:
     """Settings of a finished or unfinished folder, so that resuming it does not need them on the command line."""
     if (root / MANIFEST).exists():
         return read_manifest(root).settings
-    found = read_journal(root) if root.is_dir() else None
-    return found[0] if found else None
+    found = read_journal(root, KIND) if root.is_dir() else None
+    return found[0].settings if found else None
 
 
 def _verify(options: argparse.Namespace) -> int:

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from recordings.files import no_room, write_at_once
+from recordings.layout import array_path
 from sims.errors import SimError
 from sims.p2d import draw
-from sims.p2d.manifest import Manifest, write_at_once
 from sims.p2d.stats import MOVED_M, PUBLISHED, Stats, statistics
-from sims.p2d.store import SPLITS, array_path, no_room, total_bytes
-from sims.p2d.verify import check
+from sims.p2d.store import SPLITS, Manifest, check
 
 STRIPS = 10
 SAMPLES = 6
@@ -34,10 +34,10 @@ def write_card(root: Path, out: Path) -> Path:
     try:
         out.mkdir(parents=True, exist_ok=True)
         # JPEG keeps the page small enough for version control.
-        samples = draw.samples(manifest.classes, _crops(root, manifest, splits[0]))
+        samples = draw.samples(manifest.facts["classes"], _crops(root, manifest, splits[0]))
         samples.save(out / "samples.jpg", quality=QUALITY, subsampling=0)
         draw.strips(_strips(root, manifest, splits[-1])).save(out / "strips.jpg", quality=QUALITY, subsampling=0)
-        draw.histograms(out / "histograms.png", stats, manifest.classes)
+        draw.histograms(out / "histograms.png", stats, manifest.facts["classes"])
         write_at_once(page, _page(manifest, stats, splits))
     except OSError as error:
         raise no_room(error, error.filename or out) from error
@@ -54,7 +54,7 @@ def _crops(root: Path, manifest: Manifest, split: str) -> list[list[np.ndarray]]
     rgb, segmentation, classes, visible, amodal, _ = _arrays(root, split)
     share = visible[..., 1:] / np.maximum(amodal[..., 1:], 1)
     found: list[list[np.ndarray]] = []
-    for number in range(len(manifest.classes)):
+    for number in range(len(manifest.facts["classes"])):
         crops: list[np.ndarray] = []
         for index, slot in zip(*np.nonzero(classes == number), strict=True):
             frame = int(share[index, :, slot].argmax())
@@ -72,7 +72,7 @@ def _strips(root: Path, manifest: Manifest, split: str) -> list[tuple[str, np.nd
     rgb, segmentation, classes, *_ = _arrays(root, split)
     videos = []
     for index in range(min(STRIPS, len(rgb))):
-        names = [manifest.classes[number] for number in classes[index] if number >= 0]
+        names = [manifest.facts["classes"][number] for number in classes[index] if number >= 0]
         videos.append((f"{split}/{index}: {draw.legend(names)}", np.array(rgb[index]), np.array(segmentation[index])))
     return videos
 
@@ -91,7 +91,7 @@ re-creation.
 | | |
 |---|---|
 | trajectories | {counts}; {settings.frames} frames each |
-| size | {command}, {total_bytes(settings) / 1e9:.2f} GB |
+| size | {command}, {manifest.layout.total_bytes() / 1e9:.2f} GB |
 | objects per scene | {settings.min_objects} to {settings.max_objects} of {len(settings.objects)} classes |
 | renderer | `{settings.renderer}` |
 | seed | {settings.seed} |
@@ -164,7 +164,7 @@ def _numbers(stats: Stats) -> str:
 
 def _classes(manifest: Manifest, stats: Stats) -> str:
     lines = ["| class | trajectories | area | occlusion | moved ≥ 2 cm |", "|---|---|---|---|---|"]
-    for number, name in enumerate(manifest.classes):
+    for number, name in enumerate(manifest.facts["classes"]):
         chosen = stats.classes == number
         area = np.swapaxes(stats.area[..., 1:], 1, 2)[chosen]
         hidden = np.swapaxes(stats.occlusion[..., 1:], 1, 2)[chosen]

@@ -36,12 +36,12 @@ import cv2
 import numpy as np
 from pycocotools import mask as rle
 
+from recordings.files import no_room
+from recordings.layout import array_path
+from recordings.progress import progress
 from sims.errors import SimError
-from sims.p2d.manifest import Manifest
-from sims.p2d.progress import progress
-from sims.p2d.store import array_path, no_room
+from sims.p2d.store import Manifest, check
 from sims.p2d.trajectory import ARM_ID, FIRST_OBJECT_ID
-from sims.p2d.verify import check
 
 MARKER = ".p2d_export"
 """A file in folders of unfinished exports; others are never removed."""
@@ -124,7 +124,7 @@ def _videos(root: Path, split: str, manifest: Manifest, advance: Callable[[int],
     arrays = [np.load(array_path(root, split, name), mmap_mode=mode, allow_pickle=False) for name in names]  # type: ignore[arg-type]
     for index in range(count):
         rgb, segmentation, classes, visible, amodal = (np.asarray(array[index]) for array in arrays)
-        used = {FIRST_OBJECT_ID + slot: manifest.classes[c] for slot, c in enumerate(classes) if c >= 0}
+        used = {FIRST_OBJECT_ID + slot: manifest.facts["classes"][c] for slot, c in enumerate(classes) if c >= 0}
         visibility = np.clip(visible / np.maximum(amodal, 1), 0, 1)
         yield Video(index, rgb, segmentation, {ARM_ID: "arm", **used}, visibility)
         advance(len(rgb))
@@ -132,7 +132,7 @@ def _videos(root: Path, split: str, manifest: Manifest, advance: Callable[[int],
 
 def _coco(out: Path, split: str, videos: Iterator[Video], manifest: Manifest) -> None:
     size, frames = manifest.settings.image_size, manifest.settings.frames
-    names = ["arm", *manifest.classes]
+    names = ["arm", *manifest.facts["classes"]]
     category = {name: number for number, name in enumerate(names, start=1)}
     images: list[dict[str, Any]] = []
     annotations: list[dict[str, Any]] = []

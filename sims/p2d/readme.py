@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from sims.p2d.manifest import Manifest
-from sims.p2d.store import FIELDS, FORMAT_VERSION, SPLITS, item_shape
-
-README = "README.md"
+from recordings import Manifest
+from recordings.layout import FORMAT_VERSION
+from recordings.readme import shape_text
+from sims.p2d.settings import Settings
 
 MEANINGS = {
     "rgb": "frames",
@@ -26,14 +26,14 @@ MEANINGS = {
 }
 
 
-def readme(manifest: Manifest) -> str:
+def readme(manifest: Manifest[Settings]) -> str:
     """Markdown: a description of the data, type, shape and meaning of every array, and how to read them."""
-    settings = manifest.settings
+    settings, layout = manifest.settings, manifest.layout
     rows = "\n".join(
-        f"| `{name}.npy` | {np.dtype(field.dtype).name} | {_shape(item_shape(settings, name))} | {MEANINGS[name]} |"
-        for name, field in FIELDS.items()
+        f"| `{name}.npy` | {np.dtype(field.dtype).name} | {shape_text(layout.shape(name))} | {MEANINGS[name]} |"
+        for name, field in layout.fields.items()
     )
-    splits = "\n".join(f"| {split} | {getattr(settings, split)} |" for split in SPLITS)
+    splits = "\n".join(f"| {split} | {count} |" for split, count in layout.counts.items())
     return f"""# P2D, the Panda Pushing Dataset (re-creation)
 
 A simulated Panda arm pushes household objects over a table. A re-creation, from the description in the APEX paper
@@ -69,9 +69,5 @@ card .` writes the data card, `python -m sims.p2d export . --format coco` (or `m
 """
 
 
-def _shape(dims: tuple[int, ...]) -> str:
-    return f"(N{''.join(f', {dim}' for dim in dims)})"
-
-
-def _first(manifest: Manifest) -> str:
-    return next((split for split in SPLITS if getattr(manifest.settings, split)), SPLITS[0])
+def _first(manifest: Manifest[Settings]) -> str:
+    return next((split for split, count in manifest.layout.counts.items() if count), "train")

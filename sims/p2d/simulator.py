@@ -6,10 +6,11 @@ import hashlib
 import platform
 from pathlib import Path
 
+from recordings import Facts
 from sims import assets
-from sims.p2d.manifest import SIMULATION_VERSION, Facts
 from sims.p2d.settings import Settings
 from sims.p2d.simulate import camera, simulate
+from sims.p2d.store import SIMULATION_VERSION
 
 __all__ = ["facts", "simulate"]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from sims.p2d.manifest import Manifest
-from sims.p2d.store import SPLITS, array_path
+from recordings.layout import array_path
+from sims.p2d.store import SPLITS, Manifest
 from sims.p2d.trajectory import ARM_ID
 
 MOVED_M = 0.02

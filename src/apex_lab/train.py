@@ -25,7 +25,7 @@ from apex_lab.base.validation import one_line
 from apex_lab.config import command_line as cli
 from apex_lab.config import components, trust
 from apex_lab.config.composition import CHOICES
-from apex_lab.config.schema import Job, build_model, build_schedules, check_job, reseeded
+from apex_lab.config.schema import Job, build_model, build_schedules, check_job, needs_labels, reseeded
 from apex_lab.config.schema import device as device_of
 from apex_lab.config.upgrades import fingerprint
 from apex_lab.data import VideoSource, whole_loader
@@ -196,7 +196,7 @@ def _fit(
         "training": training,
     }
     with deferring(), ranks.started(job, settings.devices, settings.num_nodes, run.folder) as mine:
-        callbacks, keep = [*_callbacks(run), *further], _checkpoints(run, training)
+        callbacks, keep = [*_callbacks(run), *further], _checkpoints(run, training, source.labelled)
         return fit(config, model, source, device, start, training, mine, callbacks, keep, loggers, run.folder, deadline)
 
 
@@ -310,15 +310,21 @@ def _callbacks(run: Run) -> list[L.Callback]:
     return [components.build(node, f"callbacks.{name}") for name, node in run.job.config.callbacks.items()]
 
 
-def _checkpoints(run: Run, training: dict[str, Any] | None) -> own_callbacks.Checkpoints:
+def _checkpoints(run: Run, training: dict[str, Any] | None, labelled: bool) -> own_callbacks.Checkpoints:
     settings = run.job.config.trainer
+    monitor, mode = settings.monitor, settings.monitor_mode
+    if not labelled:
+        console.say("the videos have no labels, so there are no scores: look at loss, pictures and objects_present")
+        if needs_labels(monitor):
+            console.say(f"best.ckpt has the lowest val/loss, since {monitor} needs labels (trainer.monitor)")
+            monitor, mode = "val/loss", "min"
     return own_callbacks.Checkpoints(
         run,
         settings.checkpoint_interval,
         settings.validation_interval,
         settings.max_steps,
-        settings.monitor,
-        settings.monitor_mode,
+        monitor,
+        mode,
         training,
     )
 

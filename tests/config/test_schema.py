@@ -13,6 +13,9 @@ from apex_lab.config.composition import conf_dir
 from apex_lab.config.schema import build_model
 from tests.conftest import REPOSITORY, Ended, compose_job
 
+NEEDED = {"video": ["data.path=videos"], "own_video": ["data=video", "data.path=videos"]}
+"""What a choice cannot do without."""
+
 
 def words(group: str) -> list[str]:
     return sorted(path.stem for path in (REPOSITORY / "conf" / group).glob("*.yaml") if path.stem[0] != "_")
@@ -36,7 +39,8 @@ def test_every_fragment(group: str) -> None:
         # experiments of the original publications have clips as long as the paper's videos
         scale = "cpu" if group == "ablation" else "paper"
         model = word.removesuffix("_original") if word.endswith("_original") else "apex"
-        job = compose_job(f"model={model}", f"scale={scale}", "data=p2d", f"+{group}={word}")
+        data = NEEDED["own_video"] if word == "own_video" else ["data=p2d"]
+        job = compose_job(f"model={model}", f"scale={scale}", *data, f"+{group}={word}")
         assert job.choices[group] == word
 
 
@@ -50,7 +54,7 @@ def test_an_experiment_of_a_model_chooses_it(command: Callable[..., Ended]) -> N
 @pytest.mark.parametrize("group", ["logger", "callbacks", "paths", "data"])
 def test_every_choice(group: str) -> None:
     for word in words(group):
-        assert compose_job(f"{group}={word}").choices[group] == word
+        assert compose_job(f"{group}={word}", *NEEDED.get(word, [])).choices[group] == word
 
 
 def test_a_scale_is_the_size_that_it_says() -> None:

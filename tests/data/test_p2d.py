@@ -17,7 +17,7 @@ from torch.utils.data import DataLoader
 from apex_lab.base.errors import UserError
 from apex_lab.data import P2D
 from apex_lab.data.bench_loading import frames_per_second
-from sims.p2d.manifest import MANIFEST
+from recordings import MANIFEST
 from tests.fakes.p2d_fake import simulate
 from tests.fakes.p2d_tools import REPOSITORY, make, small
 

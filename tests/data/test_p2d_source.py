@@ -13,10 +13,10 @@ import yaml
 
 from apex_lab.base.errors import UserError
 from apex_lab.config.schema import components, conf_dir
-from apex_lab.data import P2DSource, training_loader, whole_loader
+from apex_lab.data import P2DSource, recorded, training_loader, whole_loader
 from apex_lab.data import p2d_source as code
-from sims.p2d.manifest import fingerprint
 from sims.p2d.settings import Settings
+from sims.p2d.store import fingerprint
 from tests.fakes.p2d_tools import FAKE
 
 SIZES = {"train": 5, "val": 3, "test": 2, "frames": 3, "image_size": 16, "workers": 0}
@@ -180,8 +180,8 @@ def test_the_full_check_is_not_done_twice(tmp_path: Path, monkeypatch: pytest.Mo
     data = source(tmp_path)
     data.prepare()
     calls: list[Path] = []
-    check = code.verify
-    monkeypatch.setattr(code, "verify", lambda root, manifest: calls.append(root) or check(root, manifest))
+    check = recorded.verify
+    monkeypatch.setattr(recorded, "verify", lambda root, manifest: calls.append(root) or check(root, manifest))
     data.prepare()
     assert calls == []
     os.utime(data.folder / "val" / "depth.npy")

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 from sims.p2d.generate import generate
-from sims.p2d.manifest import Manifest
 from sims.p2d.settings import Settings
+from sims.p2d.store import Manifest
 
 FAKE = "tests.fakes.p2d_fake"
 REPOSITORY = Path(__file__).resolve().parents[2]

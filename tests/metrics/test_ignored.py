@@ -10,6 +10,7 @@ import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
 
+from apex_lab.base.order import natural_key
 from apex_lab.metrics import (
     KEYS,
     AdjustedRandIndex,
@@ -23,7 +24,6 @@ from apex_lab.metrics import (
     link_frames,
 )
 from apex_lab.metrics.ignored import likely_void
-from apex_lab.metrics.order import natural_key
 
 VOID = 255
 

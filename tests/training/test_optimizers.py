@@ -93,6 +93,21 @@ def test_a_convolution_moves_by_its_orthogonalised_nesterov_momentum() -> None:
         torch.testing.assert_close(weight.grad, grad)  # the gradient is the caller's
 
 
+def test_updates_inside_autocast_are_those_in_full_precision() -> None:
+    """Lightning makes a step inside autocast where precision is bf16-mixed."""
+    moved = []
+    for half in (False, True):
+        torch.manual_seed(0)
+        weight = nn.Parameter(torch.randn(8, 16))
+        optimizer = Muon([weight], lr=0.1)
+        for _ in range(3):
+            weight.grad = torch.randn(8, 1) @ torch.randn(1, 16)
+            with torch.autocast("cpu", torch.bfloat16, enabled=half):
+                optimizer.step()
+        moved.append(weight.detach())
+    torch.testing.assert_close(*moved, rtol=0, atol=0)
+
+
 def test_a_linear_map_moves_as_with_pytorchs_muon() -> None:
     ours = nn.Parameter(torch.randn(4, 6, generator=torch.Generator().manual_seed(2)))
     theirs = nn.Parameter(ours.detach().clone())

@@ -321,6 +321,8 @@ def _check_objective(config: Config) -> None:
     source = components.build(config.data, "data")
     if not isinstance(source, VideoSource):
         raise UserError(f"data._target_ = {config.data['_target_']!r} is not an apex_lab.data.VideoSource.")
+    if model.needs_labels and not source.labelled:
+        raise UserError("The model needs labels, which the videos of this data set have not: choose another model.")
     for name, node in config.callbacks.items():
         components.build(node, f"callbacks.{name}")
     values = {f"schedule.{name}": value for name, value in schedules.items()}
@@ -338,7 +340,7 @@ def _check_objective(config: Config) -> None:
     _same_names("schedule", schedules, model.schedule_ranges)
     _same_names("loss", weights, model.term_names)
     if model.needs_training:
-        _check_early_stopping(config, model)
+        _check_early_stopping(config, model, source.labelled)
         build_optimizer(config, [(name, p) for name, p in model.named_parameters() if p.requires_grad])
         _check_monitor("trainer.monitor", config.trainer.monitor, model)
         _check_clips(config)
@@ -404,11 +406,21 @@ def _check_monitor(key: str, monitor: object, model: SceneModel) -> None:
         raise UserError(sentence(f"{key} = '{monitor}' is none of {', '.join(known)}{guess}"))
 
 
-def _check_early_stopping(config: Config, model: SceneModel) -> None:
+def needs_labels(monitor: str) -> bool:
+    """Whether a value of validation is a score, which only videos with labels have."""
+    return monitor.removeprefix("val/") in VALIDATION_SCORES
+
+
+def _check_early_stopping(config: Config, model: SceneModel, labelled: bool) -> None:
     """Lightning's early stopping finds out only at the first validation that there is no such score."""
     for name, node in config.callbacks.items():
         if str(node["_target_"]).endswith(".EarlyStopping") and "monitor" in node:
             _check_monitor(f"callbacks.{name}.monitor", node["monitor"], model)
+            if not labelled and needs_labels(node["monitor"]):
+                raise UserError(
+                    f"callbacks.{name}.monitor = {node['monitor']} needs labels, and these videos have none: "
+                    "set it to val/loss, and its mode to min."
+                )
             if config.trainer.validation_interval is None:
                 raise UserError(
                     f"callbacks.{name} looks at validation's scores: set trainer.validation_interval, or leave it out."

@@ -30,6 +30,7 @@ EXCLUDED = (
     "data.workers",
     "data.generate",
     "data.sim_workers",
+    "data.prepare_workers",
     "data.verify",
     "trainer.accelerator",
     "trainer.devices",

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from pydantic import Field, ValidationError
 
 from apex_lab.base.errors import UserError
 from apex_lab.data.p2d import P2D
-from apex_lab.data.source import VideoSource
-from sims.errors import SimError
-from sims.p2d.generate import generate
-from sims.p2d.manifest import MANIFEST, Manifest, fingerprint
+from apex_lab.data.recorded import RecordedSource, Verify
+from recordings import Plan
+from sims.p2d.generate import SIMULATOR, Simulator, generate
 from sims.p2d.settings import Settings
 from sims.p2d.settings_text import command_words, sentence
-from sims.p2d.verify import check, is_verified, verify
+from sims.p2d.store import KIND, plan
 
 
-class P2DSource(VideoSource):
+class P2DSource(RecordedSource):
     """The Panda Pushing Dataset with the given settings, in a folder of its own below `root`.
 
     The folder's name holds a fingerprint of the settings, so different data never meet. Data that exist are used;
@@ -44,6 +43,8 @@ class P2DSource(VideoSource):
         UserError: impossible settings.
     """
 
+    kind = KIND
+
     def __init__(
         self,
         root: str,
@@ -57,70 +58,38 @@ class P2DSource(VideoSource):
         workers: Annotated[int, Field(ge=0)] = 2,
         generate: bool = True,
         sim_workers: Annotated[int, Field(gt=0)] | None = None,
-        verify: Literal["changed", "always", "never"] = "changed",
+        verify: Verify = "changed",
     ) -> None:
         sizes = {"train": train, "val": val, "test": test, "frames": frames, "image_size": image_size}
         self.settings = _settings({"seed": data_seed, **sizes}, simulation or {})
-        self.workers = workers
-        self.generate, self.sim_workers, self.verify = generate, sim_workers, verify
-        name = f"p2d_{image_size}px_{frames}f_{fingerprint(self.settings)[:8]}"
-        self.folder = Path(root).expanduser().absolute() / name
-        self.sets: dict[str, P2D] = {}
-
-    def prepare(self) -> None:
-        """Makes sure that the data are there and are right; the first time that can take minutes.
-
-        Raises:
-            UserError: they are missing and cannot or may not be made, are damaged, or the disk is full.
-        """
-        try:
-            self._prepare()
-        except SimError as error:
-            raise UserError(str(error)) from error
-
-    def _prepare(self) -> None:
-        if not (self.folder / MANIFEST).exists():
-            if not self.generate:
-                command = f"python -m sims.p2d --out {self.folder} {command_words(self.settings)}".strip()
-                raise UserError(f"no finished P2D data at {self.folder}: set data.generate=true or run {command}")
-            generate(self.folder, self.settings, workers=self.sim_workers)
-        manifest = check(self.folder, self.settings)
-        if self.verify == "always" or (self.verify == "changed" and not is_verified(self.folder, manifest)):
-            damage = verify(self.folder, manifest)
-            if damage:
-                lines = damage.lines()
-                more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
-                raise UserError(
-                    f"{self.folder} is damaged ({lines[0]}{more}): "
-                    f"repair it with python -m sims.p2d verify {self.folder} --repair"
-                )
-
-    def open(self) -> None:
-        """Opens the splits."""
-        if not self.sets:
-            self.sets = {split: P2D(self.folder, split) for split in ("train", "val", "test")}
+        super().__init__(workers, generate, sim_workers, verify)
+        name = f"p2d_{image_size}px_{frames}f_{self.plan().fingerprint[:8]}"
+        self._folder = Path(root).expanduser().absolute() / name
 
     @property
-    def fingerprint(self) -> str:
-        """32 hex digits that are equal only for equal bytes; call after `prepare`."""
-        return self._manifest().content
+    def folder(self) -> Path:
+        """Where the data set is."""
+        return self._folder
 
-    def _manifest(self) -> Manifest:
-        try:
-            return check(self.folder, self.settings)
-        except SimError as error:
-            raise UserError(str(error)) from error
+    def plan(self) -> Plan[Settings]:
+        """What the folder must hold."""
+        return plan(self.settings)
 
-    def describe(self) -> dict[str, Any]:
-        """What a record keeps about the data; call after `prepare`."""
-        manifest = self._manifest()
-        return {
-            "name": "p2d",
-            "folder": str(self.folder),
-            "fingerprint": manifest.content,
-            "settings": self.settings.model_dump(mode="json"),
-            "versions": manifest.facts["versions"],
-        }
+    def maker(self) -> Simulator:
+        """The simulation."""
+        return Simulator(self.settings, SIMULATOR)
+
+    def make(self) -> None:
+        """Simulates missing data."""
+        generate(self.folder, self.settings, workers=self.sim_workers)
+
+    def make_command(self) -> str:
+        """The shell command that simulates missing data."""
+        return f"python -m sims.p2d --out {self.folder} {command_words(self.settings)}".strip()
+
+    def opened(self, split: str) -> P2D:
+        """One split."""
+        return P2D(self.folder, split)
 
 
 def _settings(fixed: dict[str, Any], further: Mapping[str, Any]) -> Settings:

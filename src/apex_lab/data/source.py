@@ -15,9 +15,11 @@ class VideoSource(ABC):
     Attributes:
         sets: the splits by name (train, val, test), after `open`.
         workers: processes that load training clips; 0 loads in the training process.
+        labelled: whether the videos have labels, so that they can be scored.
     """
 
     workers: int = 0
+    labelled: bool = True
     sets: Mapping[str, VideoSet]
 
     @abstractmethod

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.order import natural_path_key
 from apex_lab.base.validation import one_line, sentence, validate
 from apex_lab.config import components
 from apex_lab.config import schema as config
 from apex_lab.evaluation.other_data import OtherData
-from apex_lab.metrics.order import natural_path_key
 from apex_lab.runs import checkpoints
 
 Bad = dict[Path, str]

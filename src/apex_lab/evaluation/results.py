@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -75,7 +74,7 @@ def store(
             "frames": result["total"]["frames"],
             "labelled": len(result["per_video"]) == len(tally.evaluator.records),
             "foreground_share": tally.mean_share(),
-            "objects_present": math.fsum(tally.present.values()) / len(tally) if len(tally) else None,
+            "objects_present": tally.mean_present() if len(tally) else None,
             "terms": tally.mean_terms(),
             **about,
             "versions": result["versions"],

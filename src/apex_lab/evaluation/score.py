@@ -94,6 +94,10 @@ class Tally:
         known = [share for share in self.shares.values() if not math.isnan(share)]
         return math.fsum(known) / len(known) if known else None
 
+    def mean_present(self) -> float:
+        """Objects present in a frame, averaged over videos; NaN without any."""
+        return math.fsum(self.present.values()) / len(self) if len(self) else math.nan
+
     def __len__(self) -> int:
         return len(self.positions)
 

@@ -19,10 +19,10 @@ from PIL import Image, UnidentifiedImageError
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import draft_of
+from apex_lab.base.order import natural_key
 from apex_lab.base.signed import is_signed, signature
 from apex_lab.formats.frames import numbered
 from apex_lab.formats.video import PredictedVideo, labels_of
-from apex_lab.metrics.order import natural_key
 
 VOID_INDEX = 255
 MAX_INDEX = 254

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Int64
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.order import natural_key
 from apex_lab.formats.mot import IGNORED_CLASS
 from apex_lab.formats.rle import paint
 from apex_lab.formats.video import with_rest
 from apex_lab.metrics.contingency import BACKGROUND
-from apex_lab.metrics.order import natural_key
 from apex_lab.scene import ABSENT
 
 

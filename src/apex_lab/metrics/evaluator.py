@@ -13,13 +13,13 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float64, Integer
 
+from apex_lab.base.order import natural_key
 from apex_lab.metrics.hota import ALPHAS, HotaCounts
 from apex_lab.metrics.identity import IdentityCounts
 from apex_lab.metrics.ignored import ignored_pixels
 from apex_lab.metrics.keys import FRAME_SCORES, VIDEO_SCORES, Number, keys
 from apex_lab.metrics.linking import link_frames
 from apex_lab.metrics.objects import COLUMNS, ObjectMetadata
-from apex_lab.metrics.order import natural_key
 from apex_lab.metrics.tracking import EVENT_TYPES, TrackingCounts
 from apex_lab.metrics.video_record import EvaluatorSettings, VideoRecord, score_video, tracking_values
 

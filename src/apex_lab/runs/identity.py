@@ -16,8 +16,8 @@ import yaml
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
+from apex_lab.base.order import natural_key
 from apex_lab.config.upgrades import FORMAT, fingerprint, upgraded
-from apex_lab.metrics.order import natural_key
 from apex_lab.runs.state import RECORD
 
 NAMING = ("model", "ablation", "tuned", "data", "scale")

@@ -237,6 +237,12 @@ class Progress(L.Callback):
             return
         names = {"val/ari_fg": "ARI-FG", "val/msc_fg": "MSC-FG", "val/ari": "ARI", "val/msc": "MSC"}
         metrics = trainer.callback_metrics
+        if "val/objects_present" in metrics:  # videos without labels
+            names = {
+                "val/loss": "loss",
+                "val/objects_present": "objects per frame",
+                "val/foreground_share": "their area",
+            }
         scores = ", ".join(f"{short} {float(metrics[name]):.3f}" for name, short in names.items() if name in metrics)
         console.say(f"step {learner.step}, validation: {scores}")
 

@@ -163,6 +163,8 @@ class Learner(L.LightningModule):
         share = tally.mean_share()
         if share is not None:
             row["val/foreground_share"] = share
+        if not self._videos().labelled:
+            row["val/objects_present"] = tally.mean_present()
         if tally.evaluator.records:
             total = tally.evaluator.result()["total"]
             row.update({f"val/{k}": total[k] for k in VALIDATION_SCORES if not math.isnan(total.get(k, math.nan))})

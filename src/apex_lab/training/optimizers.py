@@ -134,7 +134,10 @@ class Muon(Optimizer):
         momenta = [self.state[weight]["momentum"] for weight in weights]
         torch._foreach_lerp_(momenta, grads, 1 - group["momentum"])
         ahead = [x.flatten(1) for x in torch._foreach_lerp(grads, momenta, group["momentum"])]
-        for weight, change in zip(weights, all_orthogonalised(ahead, group["iterations"]), strict=True):
+        # Lightning updates inside autocast where training is in half precision: bfloat16 does not carry the iteration
+        with torch.autocast(weights[0].device.type, enabled=False):
+            changes = all_orthogonalised(ahead, group["iterations"])
+        for weight, change in zip(weights, changes, strict=True):
             stretch = max(1.0, change.shape[0] / change.shape[1]) ** 0.5
             weight.sub_(change.reshape(weight.shape), alpha=group["lr"] * stretch)
 

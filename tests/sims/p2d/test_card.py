@@ -14,8 +14,8 @@ from sims.errors import SimError
 from sims.p2d import draw
 from sims.p2d.__main__ import main
 from sims.p2d.card import write_card
-from sims.p2d.manifest import read_manifest
 from sims.p2d.stats import Stats, statistics
+from sims.p2d.store import read_manifest
 from tests.fakes.p2d_tools import make, small
 
 
@@ -83,7 +83,7 @@ def test_page_has_every_part_and_no_gap(root: Path, tmp_path: Path, capsys: pyte
     for name in re.findall(r"\]\(([^)]+)\)", text):
         with Image.open(tmp_path / name) as picture:
             assert min(picture.size) > 300
-    for name in read_manifest(root).classes:
+    for name in read_manifest(root).facts["classes"]:
         assert f"| {name} |" in text
     assert "| 0.28 |" in text
     assert "| 0.06 |" in text

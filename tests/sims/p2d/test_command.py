@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from sims.p2d import __main__ as command
-from sims.p2d.manifest import read_manifest
 from sims.p2d.settings import Settings
 from sims.p2d.settings_text import SettingsError, command_words, settings_from
+from sims.p2d.store import read_manifest
 from tests.fakes.p2d_tools import FAKE, content, make, small, start, words
 
 
@@ -103,8 +103,8 @@ def test_progress_without_a_terminal_is_plain_lines(tmp_path: Path):
     _, text = process.communicate(timeout=120)
     assert process.returncode == 0
     lines = text.splitlines()
-    assert lines[0] == f"P2D {tmp_path.name}: 36 frames"
-    assert lines[-1].startswith(f"P2D {tmp_path.name}: 36 frames in ")
+    assert lines[0] == f"P2D {tmp_path.name}: 12 trajectories"
+    assert lines[-1].startswith(f"P2D {tmp_path.name}: 12 trajectories in ")
     assert "\x1b" not in text
 
 

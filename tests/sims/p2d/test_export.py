@@ -16,7 +16,7 @@ from sims.errors import SimError
 from sims.p2d import export as module
 from sims.p2d.__main__ import main
 from sims.p2d.export import export
-from sims.p2d.manifest import read_manifest
+from sims.p2d.store import read_manifest
 from tests.fakes.p2d_tools import make, small
 
 
@@ -68,7 +68,7 @@ def test_coco_masks_are_the_segmentation(root: Path, coco: Path):
 
 def test_coco_categories_are_the_classes(root: Path, coco: Path):
     stored = arrays(root, "train")
-    classes = read_manifest(root).classes
+    classes = read_manifest(root).facts["classes"]
     page = COCO(coco / "annotations" / "instances_train.json")
     for annotation in page.anns.values():
         name = page.cats[annotation["category_id"]]["name"]
@@ -115,7 +115,7 @@ def test_mot_sequences_describe_themselves(root: Path, mot: Path):
     pictures = sorted((folder / sequence["imDir"]).glob(f"*{sequence['imExt']}"))
     assert [path.name for path in pictures] == ["000001.png", "000002.png", "000003.png"]
     np.testing.assert_array_equal(cv2.imread(str(pictures[2]))[..., ::-1], stored["rgb"][1, 2])
-    classes = read_manifest(root).classes
+    classes = read_manifest(root).facts["classes"]
     named = dict(line.split() for line in (folder / "gt" / "names.txt").read_text().splitlines())
     used = [classes[number] for number in stored["classes"][1] if number >= 0]
     assert named == {"1": "arm", **{str(2 + slot): name for slot, name in enumerate(used)}}

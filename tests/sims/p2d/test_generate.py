@@ -14,11 +14,10 @@ from pathlib import Path
 
 import pytest
 
+from recordings import MANIFEST, verify
 from sims.errors import SimError
 from sims.p2d.generate import generate
-from sims.p2d.manifest import JOURNAL, MANIFEST, read_manifest
-from sims.p2d.store import keys
-from sims.p2d.verify import verify
+from sims.p2d.store import KIND, layout, read_manifest
 from tests.fakes.p2d_tools import REPOSITORY, children, content, make, small, start, words
 
 linux = pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
@@ -61,7 +60,7 @@ def test_same_bytes_after_kills_at_random_moments(tmp_path: Path, rounds: int):
     for _ in range(rounds):
         process = start(*command, FAKE_SLEEP_S=0.2)
         if rng.random() < 0.7:  # some kills find it starting, most find it working
-            _wait_for_lines(root / JOURNAL, _lines(root / JOURNAL) + 2, process)
+            _wait_for_lines(root / KIND.journal, _lines(root / KIND.journal) + 2, process)
         time.sleep(rng.uniform(0, 0.3))
         victims = children(process.pid)
         process.kill()
@@ -78,7 +77,7 @@ def test_same_bytes_when_only_workers_are_killed(tmp_path: Path, unbroken: dict[
     rng = random.Random(1)
     process = start("--out", tmp_path, *words(small()), "--workers", 2, "--no-card", FAKE_SLEEP_S=0.3)
     for lines in (2, 5, 8):  # between kills a trajectory was finished, so no trajectory reaches the limit of attempts
-        _wait_for_lines(tmp_path / JOURNAL, lines, process)
+        _wait_for_lines(tmp_path / KIND.journal, lines, process)
         time.sleep(rng.uniform(0, 0.2))
         os.kill(rng.choice(children(process.pid)), signal.SIGKILL)
     _, text = process.communicate(timeout=120)
@@ -144,7 +143,7 @@ def test_half_written_records_and_data_are_generated_again(
         patch.setenv("FAKE_REFUSE", "train-6")
         with pytest.raises(SimError):
             make(tmp_path)
-    journal = tmp_path / JOURNAL
+    journal = tmp_path / KIND.journal
     journal.write_bytes(journal.read_bytes()[:-20])  # a partial last line
     with open(tmp_path / "train" / "rgb.npy", "r+b") as file:  # power cut: a recorded trajectory never reached the disk
         file.seek(128 + 2 * 3 * 16 * 16 * 3)
@@ -216,16 +215,22 @@ def test_two_processes_generate_every_trajectory_once(tmp_path: Path, unbroken: 
 
 
 @linux
-def test_ctrl_c_ends_cleanly_and_the_same_command_resumes(tmp_path: Path, unbroken: dict[str, bytes]):
+@pytest.mark.parametrize(
+    ("number", "code", "word"),
+    [(signal.SIGINT, 130, "interrupted"), pytest.param(signal.SIGTERM, 143, "terminated", marks=pytest.mark.slow)],
+)
+def test_a_stop_ends_cleanly_and_the_same_command_resumes(
+    tmp_path: Path, unbroken: dict[str, bytes], number: int, code: int, word: str
+):
     command = ("--out", tmp_path, *words(small()), "--workers", 2, "--no-card")
     process = start(*command, FAKE_SLEEP_S=0.3)
-    _wait_for_lines(tmp_path / JOURNAL, 3, process)
+    _wait_for_lines(tmp_path / KIND.journal, 3, process)
     workers = children(process.pid)
-    os.killpg(process.pid, signal.SIGINT)
+    os.killpg(process.pid, number)
     _, text = process.communicate(timeout=120)
-    assert process.returncode == 130
+    assert process.returncode == code
     assert "Traceback" not in text
-    assert "run the same command to resume" in text
+    assert f"{word}; finished trajectories are kept, run the same command to resume" in text
     assert workers
     _wait_until_gone(workers)
     again = start(*command)
@@ -236,7 +241,7 @@ def test_ctrl_c_ends_cleanly_and_the_same_command_resumes(tmp_path: Path, unbrok
 @linux
 def test_workers_do_not_outlive_a_killed_parent(tmp_path: Path):
     process = start("--out", tmp_path, *words(small()), "--workers", 2, "--no-card", FAKE_SLEEP_S=0.3)
-    _wait_for_lines(tmp_path / JOURNAL, 2, process)
+    _wait_for_lines(tmp_path / KIND.journal, 2, process)
     workers = children(process.pid)
     process.kill()
     process.wait()
@@ -255,6 +260,7 @@ LIMITED = """
 import resource, sys
 from pathlib import Path
 resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, 10_000))
+from recordings import MANIFEST, verify
 from sims.errors import SimError
 from tests.fakes.p2d_tools import make
 try:
@@ -300,8 +306,8 @@ def test_a_disk_filled_by_others_stops_the_work_and_keeps_finished_trajectories(
         patch.setenv("FAKE_FILL", str(small_disk))
         with pytest.raises(SimError, match=r"failed \(No space left on device\): free space on that disk and run the"):
             make(root, settings)
-    made = len((root / JOURNAL).read_bytes().splitlines()) - 1
-    assert 0 < made < len(keys(settings))
+    made = len((root / KIND.journal).read_bytes().splitlines()) - 1
+    assert 0 < made < len(layout(settings).all_keys())
     (small_disk / "other_peoples_file").unlink()
     make(root, settings)
     assert content(root) == content(tmp_path / "unbroken")
@@ -312,7 +318,7 @@ def test_reserved_space_lasts_when_others_fill_the_disk(small_disk: Path, monkey
     monkeypatch.setenv("FAKE_FILL", str(small_disk))
     with pytest.raises(SimError, match="No space left on device"):  # for the small files at the end, not for the data
         make(root)
-    assert len((root / JOURNAL).read_bytes().splitlines()) == 1 + len(keys(small()))
+    assert len((root / KIND.journal).read_bytes().splitlines()) == 1 + len(layout(small()).all_keys())
     (small_disk / "other_peoples_file").unlink()
     monkeypatch.setenv("FAKE_KILL", "train-0")
     assert not verify(root, make(root))

@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("pybullet")
 
 from sims.p2d.generate import generate
-from sims.p2d.manifest import fingerprint
 from sims.p2d.settings import Settings
+from sims.p2d.store import fingerprint
 
 SETTINGS = Settings(train=2, val=1, test=1, frames=3, image_size=32)
 FINGERPRINT = "a1ef5abd443cf621"

@@ -8,11 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sims.p2d.manifest import fingerprint, read_manifest
-from sims.p2d.store import FIELDS, SPLITS, Arrays, array_bytes, array_path, checksum, header, to_parts, total_bytes
+from recordings import array_path
+from recordings.files import Arrays
+from sims.p2d.settings import Settings
+from sims.p2d.store import FIELDS, SPLITS, fingerprint, layout, read_manifest
 from sims.p2d.trajectory import Trajectory
 from tests.fakes.p2d_fake import simulate
 from tests.fakes.p2d_tools import content, make, small
+
+
+def to_parts(settings: Settings, trajectory: Trajectory) -> dict[str, memoryview]:
+    """The bytes of each field, as workers write them."""
+    return layout(settings).parts({name: getattr(trajectory, name) for name in FIELDS}, "trajectory")
 
 
 def test_fields_are_those_of_a_trajectory_in_their_order():
@@ -38,7 +45,9 @@ def test_header_is_what_numpy_would_write(tmp_path: Path):
     settings = small()
     for name, field in FIELDS.items():
         path = tmp_path / f"{name}.npy"
-        path.write_bytes(header(settings, "train", name).ljust(array_bytes(settings, "train", name), b"\0"))
+        path.write_bytes(
+            layout(settings).header("train", name).ljust(layout(settings).array_bytes("train", name), b"\0")
+        )
         array = np.load(path, allow_pickle=False)
         assert array.dtype == np.dtype(field.dtype)
         assert path.stat().st_size == 128 + array.nbytes
@@ -47,7 +56,7 @@ def test_header_is_what_numpy_would_write(tmp_path: Path):
 def test_sizes_add_up(tmp_path: Path):
     settings = small()
     make(tmp_path, settings)
-    assert sum(path.stat().st_size for path in tmp_path.glob("*/*.npy")) == total_bytes(settings)
+    assert sum(path.stat().st_size for path in tmp_path.glob("*/*.npy")) == layout(settings).total_bytes()
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -56,14 +65,14 @@ def test_checksum_sees_every_field(name: str):
     parts = to_parts(settings, simulate(settings, "train", 0))
     flipped = bytearray(parts[name])
     flipped[-1] ^= 1
-    assert checksum(parts) != checksum({**parts, name: memoryview(flipped)})
+    assert layout(settings).checksum(parts) != layout(settings).checksum({**parts, name: memoryview(flipped)})
 
 
 def test_checksum_of_the_disk_is_that_of_the_arrays(tmp_path: Path):
     manifest = make(tmp_path)
-    arrays = Arrays(tmp_path, "val", small())
+    arrays = Arrays(tmp_path, "val", layout(small()))
     parts = to_parts(small(), simulate(small(), "val", 1))
-    assert arrays.checksum(1) == checksum(parts) == manifest.records["val", 1].checksum
+    assert arrays.checksum(1) == layout(small()).checksum(parts) == manifest.records["val", 1].checksum
     arrays.close()
 
 
@@ -97,8 +106,8 @@ def test_manifest_is_complete_and_reads_back(tmp_path: Path):
     assert read == made
     assert read.settings == small()
     assert read.fingerprint == fingerprint(small())
-    assert read.classes == list(small().objects)
-    assert [read.records["test", i].redraws for i in range(2)] == [
+    assert read.facts["classes"] == list(small().objects)
+    assert [read.records["test", i].notes["redraws"] for i in range(2)] == [
         simulate(small(), "test", i).redraws for i in range(2)
     ]
 

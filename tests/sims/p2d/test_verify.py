@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 
+from recordings import MANIFEST, is_verified, verify
+from recordings.plan import digest
+from recordings.verify import VERIFIED
 from sims.errors import SimError
 from sims.p2d.generate import generate, repair
-from sims.p2d.manifest import JOURNAL, MANIFEST, read_manifest
-from sims.p2d.store import FIELDS
-from sims.p2d.verify import VERIFIED, check, is_verified, verify
+from sims.p2d.store import FIELDS, KIND, check, read_manifest
 from tests.fakes.p2d_tools import FAKE, content, make, small, start
 
 
@@ -172,10 +173,8 @@ def test_another_format_is_refused(root: Path):
 def test_settings_of_a_later_version_are_refused(root: Path):
     data = json.loads((root / MANIFEST).read_text())
     data["settings"]["wind_m_s"] = 3
-    from sims.p2d import manifest
-
     data.pop("checksum")
-    data["checksum"] = manifest._digest(data)
+    data["checksum"] = digest(data)
     (root / MANIFEST).write_text(json.dumps(data))
     with pytest.raises(SimError, match="made by another version of this program"):
         check(root)
@@ -215,7 +214,7 @@ def test_a_killed_repair_can_be_started_again(root: Path, made: Path):
         time.sleep(0.02)
     os.killpg(process.pid, signal.SIGKILL)
     process.communicate()
-    assert 0 < len(verify(root, read_manifest(root), shown=False).trajectories) < 8
+    assert 0 < len(verify(root, read_manifest(root), shown=False).items) < 8
     again = start("verify", root, "--repair", "--workers", 1)
     text, _ = again.communicate(timeout=120)
     assert again.returncode == 0
@@ -257,8 +256,8 @@ def test_a_damaged_record_of_the_last_check_is_ignored(root: Path):
 
 def test_manifest_and_journal_both_damaged_is_reported(root: Path):
     flip(root / MANIFEST, 5)
-    (root / JOURNAL).unlink()
+    (root / KIND.journal).unlink()
     with pytest.raises(
-        SimError, match=r"is damaged and trajectories\.jsonl is missing: delete the folder and generate"
+        SimError, match=r"is damaged and trajectories\.jsonl is missing: delete the folder, if it holds nothing else"
     ):
         repair(root, simulator=FAKE)

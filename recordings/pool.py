@@ -1,4 +1,4 @@
-"""A pool of worker processes that generate trajectories; a dead worker is replaced and its trajectory retried."""
+"""A pool of worker processes that make items; a dead worker is replaced and its item retried."""
 
 from __future__ import annotations
 
@@ -10,35 +10,37 @@ from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, Pipe, wait
-from pathlib import Path
-from typing import Any
 
-from sims.errors import SimError
-from sims.p2d.manifest import Facts, Record
-from sims.p2d.settings import Settings
-from sims.p2d.store import Key, no_room
+from recordings.errors import RecordingError
+from recordings.files import no_room
+from recordings.layout import Key
+from recordings.manifest import Record
+from recordings.plan import Facts
+from recordings.worker import Job, Message, Workshop
 
 TRIES = 3
-"""Attempts at a trajectory (or at the start of a worker) before the death of its worker becomes an error."""
-
-RECYCLE = 200
-"""Trajectories after which a worker is replaced: the physics engine's memory grows with every reset."""
+"""Attempts at an item (or at the start of a worker) before the death of its worker becomes an error."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A trajectory to generate; with `expected`, it is written only if it has that checksum."""
+    """An item to make; with `expected`, it is written only if it has that checksum."""
 
     key: Key
     expected: str | None = None
 
 
 class Pool:
-    """Worker processes for one folder. A context manager: all workers have ended when it exits."""
+    """Worker processes for one folder. A context manager: all workers have ended when it exits.
 
-    def __init__(self, root: Path, settings: Settings, simulator: str, workers: int, recycle: int = RECYCLE) -> None:
-        self.job = (str(root), settings.model_dump_json(), simulator)
-        self.root, self.size, self.recycle = root, workers, recycle
+    Args:
+        job: what the workers get.
+        workers: how many.
+        recycle: items after which a worker is replaced; None: never.
+    """
+
+    def __init__(self, job: Job, workers: int, recycle: int | None = None) -> None:
+        self.job, self.size, self.recycle = job, workers, recycle
         self.workers: dict[Connection, _Worker] = {}
         self.deaths: Counter[Key | None] = Counter()
         self.facts: Facts | None = None
@@ -54,10 +56,10 @@ class Pool:
         self.workers = {}
 
     def start(self) -> Facts:
-        """Starts the first worker; returns the facts of the simulator.
+        """Starts the first worker; returns the facts of the maker.
 
         Raises:
-            SimError: the simulator is not installed or cannot start.
+            RecordingError: the maker cannot work here.
         """
         while self.facts is None:
             if not self.workers:
@@ -67,10 +69,10 @@ class Pool:
         return self.facts
 
     def run(self, tasks: Iterable[Task]) -> Iterator[tuple[Key, Record]]:
-        """Generates all trajectories; yields each when its bytes have been written, in the order in which they finish.
+        """Makes all items; yields each when its bytes have been written, in the order in which they finish.
 
         Raises:
-            SimError: a trajectory cannot be generated or has another checksum than expected, or the disk is full.
+            RecordingError: an item cannot be made or has another checksum than expected, or the disk is full.
         """
         queue = deque(tasks)
         left = len(queue)
@@ -90,7 +92,7 @@ class Pool:
         worker = _Worker(self.job)
         self.workers[worker.connection] = worker
 
-    def _messages(self) -> Iterator[tuple[_Worker, tuple[Any, ...] | None]]:
+    def _messages(self) -> Iterator[tuple[_Worker, Message | None]]:
         """Waits for messages; yields each with its worker, or None as the message of a dead worker."""
         for connection in wait(list(self.workers)):
             worker = self.workers[connection]  # type: ignore[index]
@@ -99,51 +101,86 @@ class Pool:
             except (EOFError, OSError):
                 yield worker, None
 
-    def _handle(
-        self, worker: _Worker, message: tuple[Any, ...] | None, queue: deque[Task]
-    ) -> tuple[Key, Record] | None:
+    def _handle(self, worker: _Worker, message: Message | None, queue: deque[Task]) -> tuple[Key, Record] | None:
         if message is None:
             self._replace(worker, queue)
             return None
-        kind, *content = message
-        if kind == "ready":
-            self.facts = content[0]
+        if message[0] == "ready":
+            self.facts = message[1]
             worker.ready = True
             self.deaths[None] = 0
             return None
-        if kind == "failed":
-            raise SimError(content[0])
-        if kind == "disk":
-            raise no_room(OSError(content[0], ""), content[1])
-        task = worker.take()
-        if kind == "differs":
-            raise SimError(
-                f"trajectory {_name(task.key)} came out with other bytes than those recorded in {self.root}: it was "
-                "made with other versions or on another kind of processor; repair it there, or generate the data again"
-            )
-        if worker.made >= self.recycle:
+        done = finished(message, self.job, worker.task)
+        worker.take()
+        if self.recycle is not None and worker.made >= self.recycle:
             del self.workers[worker.connection]
             worker.stop()
             worker.end()
-        return task.key, Record(checksum=content[0], redraws=content[1])
+        return done
 
     def _replace(self, worker: _Worker, queue: deque[Task]) -> None:
-        """Removes a dead worker and puts its trajectory at the front of the queue, or raises after `TRIES` deaths."""
+        """Removes a dead worker and puts its item at the front of the queue, or raises after `TRIES` deaths."""
         del self.workers[worker.connection]
         code = worker.end()
         key = worker.task.key if worker.task else None
         self.deaths[key] += 1
         if self.deaths[key] >= TRIES:
-            what = f"making trajectory {_name(key)}" if key else "starting"
-            raise SimError(
-                f"a simulation worker died {TRIES} times while {what} ({_cause(code)}): {worker.last_line()}"
-            )
+            what = f"making {_name(self.job, key)}" if key else "starting"
+            raise RecordingError(f"a worker died {TRIES} times while {what} ({_cause(code)}): {worker.last_line()}")
         if worker.task:
             queue.appendleft(worker.task)
 
 
+class Alone:
+    """Makes items in this process: for few small ones, where starting workers would take longer. As `Pool`."""
+
+    def __init__(self, job: Job) -> None:
+        self.job, self.workshop = job, Workshop(job)
+
+    def __enter__(self) -> Alone:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.workshop.close()
+
+    def start(self) -> Facts:
+        """The facts of the maker."""
+        kind, content = self.workshop.ready()
+        if kind == "failed":
+            raise RecordingError(content)
+        facts: Facts = content
+        return facts
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[tuple[Key, Record]]:
+        """Makes all items in their order."""
+        for task in tasks:
+            message = self.workshop.make(*task.key, task.expected)
+            assert message is not None
+            yield finished(message, self.job, task)
+
+
+def finished(message: Message, job: Job, task: Task | None) -> tuple[Key, Record]:
+    """The finished item that a message tells of.
+
+    Raises:
+        RecordingError: it tells of a failure.
+    """
+    kind, *content = message
+    if kind == "failed":
+        raise RecordingError(content[0])
+    if kind == "disk":
+        raise no_room(OSError(content[0], ""), content[1])
+    assert task is not None
+    if kind == "differs":
+        raise RecordingError(
+            f"{_name(job, task.key)} came out with other bytes than those recorded in {job.root}: it was made with "
+            "other versions or on another kind of processor; repair it there, or generate the data again"
+        )
+    return task.key, Record(checksum=content[0], notes=content[1])
+
+
 class _Worker:
-    def __init__(self, job: tuple[str, str, str]) -> None:
+    def __init__(self, job: Job) -> None:
         self.connection, theirs = Pipe()
         self.log = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the process
         self.task: Task | None = None
@@ -159,7 +196,7 @@ class _Worker:
         }
         with theirs:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "sims.p2d.worker", str(theirs.fileno())],
+                [sys.executable, "-m", "recordings.worker", str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],
                 stdin=subprocess.DEVNULL,
                 stdout=self.log,
@@ -176,11 +213,9 @@ class _Worker:
         self.task = task
         self._send((*task.key, task.expected))
 
-    def take(self) -> Task:
-        task, self.task = self.task, None
-        assert task is not None
+    def take(self) -> None:
+        self.task = None
         self.made += 1
-        return task
 
     def _send(self, message: object) -> None:
         try:
@@ -211,8 +246,8 @@ class _Worker:
         return lines[-1] if lines else "it printed nothing"
 
 
-def _name(key: Key) -> str:
-    return f"{key[0]}/{key[1]}"
+def _name(job: Job, key: Key) -> str:
+    return f"{job.item} {key[0]}/{key[1]}"
 
 
 def _cause(code: int) -> str:

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from sims.p2d.progress import progress
+from recordings.progress import progress
 
 
 def test_plain_lines_every_15_seconds(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

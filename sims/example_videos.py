@@ -1,0 +1,100 @@
+"""`python -m sims.example_videos --out FOLDER`: example "own videos": MP4 files of a scene that P2D does not have.
+
+The camera stands on the other side of the table and higher, the table has a green cloth, and other objects lie on it.
+The files look like those of a still camera: 4 : 3, 15 frames a second, compressed; there are no labels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from recordings.progress import progress
+from sims.background import background
+from sims.camera import Camera
+from sims.errors import SimError
+from sims.p2d.settings import Settings
+from sims.p2d.simulate import simulate
+
+CAMERA = Camera(eye=(1.22, 0.42, 0.72), target=(0.5, -0.03, 0.0), fov_deg=33.0)
+OBJECTS = ("mug", "banana", "cracker_box", "orange", "foam_brick", "mustard_bottle")
+CLOTH = np.array([0.42, 0.86, 0.72], dtype=np.float32)
+"""What the wood's red, green and blue are multiplied by: a green cloth with the table's own shading and shadows."""
+FRAMES_PER_S = 15
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Writes the videos that are missing; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="python -m sims.example_videos", description=__doc__.split("\n\n")[0])
+    parser.add_argument("--out", type=Path, required=True, help="folder for the MP4 files")
+    parser.add_argument("--videos", type=int, default=20, help="how many (default: 20)")
+    parser.add_argument("--frames", type=int, default=48, help="frames per video (default: 48)")
+    parser.add_argument("--size", type=int, default=192, help="width in pixels (default: 192)")
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args(arguments)
+    try:
+        settings = Settings(
+            seed=options.seed,
+            frames=options.frames,
+            image_size=options.size,
+            min_objects=2,
+            max_objects=3,
+            objects=OBJECTS,
+            camera=CAMERA,
+            aim=0.8,
+        )
+        write_videos(options.out, settings, options.videos)
+    except (SimError, OSError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 1
+    print(f"{options.out}: {options.videos} videos")
+    return 0
+
+
+def write_videos(out: Path, settings: Settings, videos: int) -> None:
+    """Simulates and writes each video that is not there yet; a file has its final name when it is whole.
+
+    Raises:
+        SimError: PyBullet is missing, or the video cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    with progress("example videos", videos, "videos") as advance:
+        for index in range(videos):
+            path = out / f"push_{index:02d}.mp4"
+            if not path.exists():
+                draft = path.with_name(f".{path.name}")
+                write_video(draft, frames(settings, index))
+                draft.rename(path)
+            advance(1)
+
+
+def frames(settings: Settings, index: int) -> np.ndarray:
+    """(T, H, W, 3) uint8 RGB, H = 3/4 W: one push, on the cloth."""
+    trajectory = simulate(settings, "example", index)
+    cloth = background(settings.camera, settings.image_size).table & (trajectory.segmentation == 0)
+    rgb = np.where(cloth[..., None], trajectory.rgb * CLOTH, trajectory.rgb)
+    height = settings.image_size * 3 // 4 // 2 * 2
+    top = (settings.image_size - height) // 2
+    return np.rint(rgb).astype(np.uint8)[:, top : top + height]
+
+
+def write_video(path: Path, video: np.ndarray) -> None:
+    """Writes (T, H, W, 3) uint8 RGB as MPEG-4.
+
+    Raises:
+        SimError: OpenCV cannot write there.
+    """
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_S, video.shape[2:0:-1])
+    if not writer.isOpened():
+        raise SimError(f"{path} cannot be written: choose another folder")
+    for frame in video:
+        writer.write(np.ascontiguousarray(frame[..., ::-1]))
+    writer.release()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
