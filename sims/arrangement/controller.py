@@ -5,7 +5,7 @@ It knows what perception finds in images without the arm, and its own arm; nothi
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -336,13 +336,13 @@ class Controller:
         self.current = None
 
 
-def _is_free(body: Body, target: Body, others: list[Body]) -> bool:
+def _is_free(body: Body, target: Body, others: Sequence[Body]) -> bool:
     """Whether an object would stand apart from all others at its target, turned as there or as it is."""
     there = replace(body, centre=target.centre, yaw=target.yaw)
     return all(separate(there.outline, other.outline, CLEAR_M) for other in others)
 
 
-def _room(body: Body, others: list[Body]) -> bool:
+def _room(body: Body, others: Sequence[Body]) -> bool:
     """Whether the hand can go down to a body without touching others."""
     around = hands(body.centre, body.sides, body.yaw)
     return any(all(separate(hand, other.outline, CLEAR_M) for other in others) for hand in around)
