@@ -211,7 +211,7 @@ def _line(key: Key, record: Record) -> dict[str, Any]:
 
 
 def _identity(plan: Plan[S]) -> dict[str, Any]:
-    return plan.kind.identity() if plan.kind.describes_itself else {}
+    return plan.kind.identity(plan.settings) if plan.kind.describes_itself else {}
 
 
 def _facts(plan: Plan[S], data: dict[str, Any], known: set[str]) -> Facts:

@@ -95,7 +95,7 @@ class Kind(Generic[S]):
         plain: dict[str, Any] = json.loads(json.dumps(settings))
         return plain
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self, settings: S) -> dict[str, Any]:
         """What the fingerprint covers besides format, settings and layout."""
         return {"kind": self.name, "version": self.version}
 
@@ -133,7 +133,11 @@ class Plan(Generic[S]):
         Package versions are in the manifest instead (`facts["versions"]`), because prepared data must be found by their
         settings on machines that cannot make them too.
         """
-        wish = {"format": FORMAT_VERSION, **self.kind.identity(), "settings": self.kind.dump(self.settings)}
+        wish = {
+            "format": FORMAT_VERSION,
+            **self.kind.identity(self.settings),
+            "settings": self.kind.dump(self.settings),
+        }
         return digest({**wish, **stored_layout(self, meanings=False)})[:16]
 
     def difference(self, other: Plan[S]) -> str | None:

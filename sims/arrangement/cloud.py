@@ -82,10 +82,8 @@ def body_of(view: View, points: np.ndarray, mask: np.ndarray) -> Body | None:
 
 def strangers(view: View, points: np.ndarray, masks: list[np.ndarray], low: np.ndarray, high: np.ndarray) -> list[Body]:
     """Bodies between `low` (2,) and `high` (2,) metres that stand on the table under none of the masks."""
-    free: np.ndarray = np.ones(points.shape[:2], dtype=np.uint8)
-    for mask in masks:
-        free[mask] = 0
-    free = cv2.erode(free, np.ones((2 * GROWN_PX + 1,) * 2, np.uint8))
+    covered = np.any([np.zeros(points.shape[:2], dtype=bool), *masks], axis=0)
+    free = cv2.erode((~covered).astype(np.uint8), np.ones((2 * GROWN_PX + 1,) * 2, np.uint8))
     left = points[free > 0]
     with np.errstate(invalid="ignore"):
         inside = ((left[:, :2] > low) & (left[:, :2] < high)).all(axis=1)

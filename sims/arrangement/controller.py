@@ -342,7 +342,7 @@ def _is_free(body: Body, target: Body, others: Sequence[Body]) -> bool:
     return all(separate(there.outline, other.outline, CLEAR_M) for other in others)
 
 
-def _room(body: Body, others: list[Body]) -> bool:
+def _room(body: Body, others: Sequence[Body]) -> bool:
     """Whether the hand can go down to a body without touching others."""
     around = hands(body.centre, body.sides, body.yaw)
     return any(all(separate(hand, other.outline, CLEAR_M) for other in others) for hand in around)

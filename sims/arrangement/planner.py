@@ -119,7 +119,8 @@ class Planner:
         self, start: np.ndarray, point: np.ndarray, yaw: float, end: np.ndarray, end_yaw: float, fingers: float
     ) -> np.ndarray | None:
         """Joint angles (N, 7) along a straight line, from `start` (7,) at `point`; None if something is in the way."""
-        count = int(np.ceil(max(float(np.linalg.norm(end - point)) / STEP_M, abs(end_yaw - yaw) / STEP_RAD, 1)))
+        way = float(np.linalg.norm(end - point))
+        count = int(np.ceil(max(way / STEP_M, abs(end_yaw - yaw) / STEP_RAD, 1.0)))
         path = [start]
         for share in np.linspace(0, 1, count + 1)[1:].tolist():
             angles = self.reach(point + share * (end - point), yaw + share * (end_yaw - yaw), path[-1])

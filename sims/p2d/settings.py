@@ -13,6 +13,11 @@ Span = Annotated[tuple[float, float], Field(strict=False)]
 Names = Annotated[tuple[str, ...], Field(strict=False)]
 
 
+CROWDED = 4
+"""From this many objects on, places are drawn many at once, the largest objects first: one by one, nearly all tries
+fail for lack of room. Trajectories of fewer keep the draws on which the bytes of data sets depend."""
+
+
 class Settings(BaseModel):
     """Settings of a P2D data set; two sets with equal settings (and versions) have equal bytes.
 

@@ -10,7 +10,7 @@ from recordings import Facts
 from sims import assets
 from sims.p2d.settings import Settings
 from sims.p2d.simulate import camera, simulate
-from sims.p2d.store import SIMULATION_VERSION
+from sims.p2d.store import simulation_version
 
 __all__ = ["facts", "simulate"]
 
@@ -18,7 +18,7 @@ __all__ = ["facts", "simulate"]
 def facts(settings: Settings) -> Facts:
     """Versions of everything besides the settings that determines the bytes, the camera, the class names."""
     versions = {
-        "simulation": str(SIMULATION_VERSION),
+        "simulation": str(simulation_version(settings)),
         "models": str(assets.FORMAT),
         **assets.versions(),
         "machine": platform.machine(),

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sims.assets import ObjectModel, object_models
 from sims.errors import SimError
 from sims.outlines import cover
-from sims.p2d.settings import Settings
+from sims.p2d.settings import CROWDED, Settings
 from sims.rectangles import Rectangles, rectangle, separate
 
 MARGIN_M = 0.015
@@ -34,10 +34,8 @@ SEEN = 0.4
 OUTLINE_PX = 64
 DROP_M = 0.0005
 TRIES = 20
-CROWDED = 4
-"""From this many objects on, places are drawn `CANDIDATES` at once, the largest objects first: one by one, nearly all
-tries fail for lack of room. With fewer, the draws are those of `_place`, on which the bytes of data sets depend."""
 CANDIDATES, CROWDED_TRIES = 48, 150
+"""For `CROWDED` objects or more: places drawn at once for one object, and tries."""
 SAME_CLASSES = 5
 
 

@@ -22,12 +22,14 @@ from pydantic import ValidationError
 import recordings
 from recordings import Field, Layout, Plan
 from sims.p2d.readme import readme
-from sims.p2d.settings import Settings
+from sims.p2d.settings import CROWDED, Settings
 
 SPLITS = ("train", "val", "test")
 
 SIMULATION_VERSION = 1
 """Raise whenever the simulation gives other bytes for the same settings, so that old and new data are not mixed."""
+CROWDED_VERSION = 2
+"""Instead of it for settings with `CROWDED` objects or more: 2 since their places are drawn many at once."""
 
 FIELDS: dict[str, Field] = {
     "rgb": Field("|u1", ("T", "S", "S", 3)),
@@ -74,9 +76,9 @@ class P2DKind(recordings.Kind[Settings]):
         """Settings as JSON data."""
         return settings.model_dump(mode="json")
 
-    def identity(self) -> dict[str, Any]:
+    def identity(self, settings: Settings) -> dict[str, Any]:
         """What else the fingerprint covers."""
-        return {"simulation": SIMULATION_VERSION}
+        return {"simulation": simulation_version(settings)}
 
     def layout(self, settings: Settings, stored: Mapping[str, Any]) -> Layout:
         """The arrays of a folder with these settings."""
@@ -88,6 +90,11 @@ class P2DKind(recordings.Kind[Settings]):
 
 
 KIND = P2DKind()
+
+
+def simulation_version(settings: Settings) -> int:
+    """The version of the simulation for these settings."""
+    return CROWDED_VERSION if settings.max_objects >= CROWDED else SIMULATION_VERSION
 
 
 def layout(settings: Settings) -> Layout:
