@@ -18,7 +18,7 @@ LONGEST = 300
 """Characters of a value that a sentence shows."""
 
 
-def _openable(path: str) -> str:
+def openable(path: str) -> str:
     """A path that the system can look for; there need not be anything.
 
     Raises:
@@ -36,7 +36,7 @@ def _openable(path: str) -> str:
     return path
 
 
-PathText = Annotated[str, AfterValidator(_openable)]
+PathText = Annotated[str, AfterValidator(openable)]
 """A path in a configuration: not empty, and possible on this system."""
 
 

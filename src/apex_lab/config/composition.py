@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import did_you_mean, sentence
+from apex_lab.base.validation import did_you_mean, openable, sentence, shown
 from apex_lab.config import trust
 from apex_lab.config.upgrades import fingerprint
 
@@ -214,7 +214,22 @@ def outputs_folder(words: Sequence[str]) -> Path:
         UserError: they set no folder.
     """
     with composing(words):
-        return Path(str(plain(compose("train", overrides=list(words)))["paths"]["outputs"]))
+        paths = plain(compose("train", overrides=list(words)))["paths"]
+        return folder_of_runs(paths.get("outputs") if isinstance(paths, Mapping) else paths)
+
+
+def folder_of_runs(value: object) -> Path:
+    """The folder that `paths.outputs` names.
+
+    Raises:
+        UserError: it names none, as an unset variable does.
+    """
+    if not isinstance(value, str):
+        raise UserError(f"paths.outputs = {shown(value)} is wrong: give a folder.")
+    try:
+        return Path(openable(value))
+    except ValueError as error:
+        raise UserError(f"paths.outputs = {shown(value)} is wrong: {error}.") from error
 
 
 def _check_tuned(choices: Mapping[str, str], runtime: Any) -> None:

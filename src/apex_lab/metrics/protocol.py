@@ -57,6 +57,10 @@ mean over videos, each one vote.
 MSC-FG and SC-FG, which otherwise count them as 1, 0 and 0: it lowers the first and raises the others. `empty_frames`
 is their number. `mbo` and `miou` always leave them out.
 
+`scoring.first_frame=k` scores segmentation (section 1, `mbo`, `miou`, J and F) as if every video began at frame k, so
+that the first frames, in which a model that works frame by frame still finds its objects, do not count. Frames keep
+their numbers; tracking has a first frame of its own (section 2), and results per object are of all frames.
+
 ## 2. Tracking
 MOTA to MT follow Weis et al. [4], CLEAR MOT [5] with mask IoU, computed with py-motmetrics. For every video:
 

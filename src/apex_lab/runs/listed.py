@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from apex_lab.config import preflight
+from apex_lab.config.composition import folder_of_runs
 from apex_lab.config.upgrades import EXCLUDED
 from apex_lab.runs.identity import Outputs, group_name, run_folder
 from apex_lab.runs.state import RunState, read_state
@@ -71,10 +72,11 @@ def listed(words: Sequence[str], config_dir: str | None = None) -> list[Listed]:
         UserError: words that Hydra refuses, or that no run can have; one sentence.
     """
     found: dict[Path, Listed] = {}
-    outputs: dict[str, Outputs] = {}
+    outputs: dict[Path, Outputs] = {}
     for made in preflight.listed(words, config_dir):
-        where = str(made.raw["paths"]["outputs"])
-        place = outputs.setdefault(where, Outputs(Path(where)))
+        paths = made.raw.get("paths")
+        where = folder_of_runs(paths.get("outputs") if isinstance(paths, dict) else paths)
+        place = outputs.setdefault(where, Outputs(where))
         folder = run_folder(place, made.identity, made.choices, made.raw["seed"])
         if folder not in found:  # jobs may differ in words that change no result
             found[folder] = Listed(made.words, made.raw, made.choices, made.identity, read_state(folder))
