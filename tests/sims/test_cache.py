@@ -61,6 +61,16 @@ def test_a_failure_leaves_nothing_behind() -> None:
     assert (cache.made_once("thing", {}, _slow_make) / "second").is_file()
 
 
+def test_a_cache_that_cannot_be_written_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file" / "cache", Path("/proc/cache")):
+        monkeypatch.setenv("APEX_LAB_CACHE", str(place))
+        with pytest.raises(
+            SimError, match=rf"the cache at {place} cannot be written .*: set APEX_LAB_CACHE to a folder"
+        ):
+            cache.made_once("thing", {}, _slow_make)
+
+
 @pytest.mark.parametrize("damage", ["flipped", "cut", "deleted", "unsealed"])
 def test_damaged_files_are_made_again(damage: str) -> None:
     folder = cache.made_once("thing", {}, _slow_make)

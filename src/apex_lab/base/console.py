@@ -20,15 +20,7 @@ class _ToStream(logging.Handler):
     """Messages to stdout, warnings and errors to stderr, whichever streams these are at that moment."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        stream = sys.stderr if record.levelno >= logging.WARNING else sys.stdout
-        if stream is None:
-            return
-        text = self.format(record) + "\n"
-        try:
-            stream.write(_printable(text, stream))
-            stream.flush()
-        except (OSError, ValueError):  # nobody reads any more (`| head`), the disk is full, or it is closed
-            _silence(stream)
+        put(self.format(record) + "\n", error=record.levelno >= logging.WARNING)
 
 
 class _ToFile(logging.FileHandler):
@@ -57,6 +49,18 @@ def setup() -> None:
     warnings.filterwarnings("ignore", message=".*have no `val_dataloader`.*")
     warnings.filterwarnings("ignore", message=".*treespec, LeafSpec.*")
     warnings.filterwarnings("ignore", message=".*GPU available but not used.*")
+
+
+def put(text: str, error: bool = False) -> None:
+    """Prints text as it is, on standard error or output, as far as that is possible."""
+    stream = sys.stderr if error else sys.stdout
+    if stream is None:
+        return
+    try:
+        stream.write(_printable(text, stream))
+        stream.flush()
+    except (OSError, ValueError):  # nobody reads any more (`| head`), the disk is full, or it is closed
+        _silence(stream)
 
 
 def note(message: str) -> None:

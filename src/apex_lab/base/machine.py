@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -56,8 +57,11 @@ def _in_use(group: Path, use: str) -> int:
 def bounded_memory() -> Iterator[None]:
     """Inside, taking more memory than is free raises an exception, where the system would end the process.
 
-    Where the system has no such bounds (only Linux and some others do), nothing changes.
+    Where the system has no such bounds (Linux has them), and in other threads than the main one, nothing changes.
     """
+    if threading.current_thread() is not threading.main_thread():
+        yield  # the bound is the process's: two threads would undo each other's
+        return
     try:
         import resource
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import torch
 
+from apex_lab.base import faults
 from apex_lab.base.errors import UserError
 from apex_lab.benchmark.child import death
 from apex_lab.benchmark.measure import once, spread
@@ -94,16 +95,23 @@ def timed_step(work: Workload) -> Callable[[], tuple[float, float]]:
 def _serve(asked: Comparison, name: str, parent: Connection) -> None:
     """Makes a step whenever the parent asks for one, and ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it too, and ends this process
-    step = timed_step(workload(asked, name))
+    try:
+        with faults.net(name):
+            _answer(timed_step(workload(asked, name)), name, parent)
+    except UserError as error:
+        parent.send(UserError(str(error)))  # without its cause, which may not travel
+
+
+def _answer(step: Callable[[], tuple[float, float]], name: str, parent: Connection) -> None:
     try:
         while True:
             parent.recv()
             parent.send(step())
     except EOFError:
         return
-    except torch.OutOfMemoryError:
+    except torch.OutOfMemoryError as error:
         less = "lower clips.batch_size, clips.frames or data.image_size, or set bench.compare=false."
-        parent.send(UserError(f"The GPU's memory does not hold the step of {name}: {less}"))
+        raise UserError(f"The GPU's memory does not hold the step of {name}: {less}") from error
 
 
 @contextlib.contextmanager

@@ -201,13 +201,11 @@ def _supervise(
 def _pump(pipe: IO[bytes] | None, to: int, title: str) -> threading.Thread:
     """Passes on a job's lines, each with the job's title."""
     assert pipe is not None
-    stream = sys.stdout if to == 1 else sys.stderr
 
     def pump() -> None:
         with pipe:
-            for line in pipe:
-                stream.write(f"[{title}] {line.decode(errors='replace').rstrip()}\n")
-                stream.flush()
+            for line in pipe:  # read to the end whoever listens, or the job would wait for that
+                console.put(f"[{title}] {line.decode(errors='replace').rstrip()}\n", error=to == 2)
 
     thread = threading.Thread(target=pump, daemon=True)
     thread.start()

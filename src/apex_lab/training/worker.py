@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 from collections.abc import Iterable
 from pathlib import Path
 
 import torch
 
-from apex_lab.base import console, interrupts
+from apex_lab.base import console, faults, interrupts
+from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted
 from apex_lab.config import components, trust
 from apex_lab.config.schema import Config, build_model
@@ -24,8 +26,13 @@ def main() -> None:
         signal.signal(number, signal.SIG_IGN)  # rank 0 decides when to stop
     end_with_parent()
     console.setup()
-    with contextlib.suppress(Interrupted):  # all ranks stop; rank 0 says so
-        train_along(Path(os.environ[JOB]), Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"])))
+    ranks = Ranks(int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
+    try:
+        with contextlib.suppress(Interrupted), faults.net(f"rank {ranks.rank}"):  # all ranks stop; rank 0 says so
+            train_along(Path(os.environ[JOB]), ranks)
+    except UserError as error:
+        console.error(str(error))
+        sys.exit(1)
 
 
 def train_along(file: Path, ranks: Ranks, known: Iterable[str] | None = None) -> None:
