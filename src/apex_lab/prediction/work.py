@@ -256,7 +256,8 @@ class VideoPrediction:
         os.replace(results, self.place)
         self.journal.clear()
         objects = len(self.reader.names.ids)
-        console.say(f"{self.name}: {done} frames, {objects} objects, {done / max(seconds, 1e-9):.1f} frames per second")
+        found = f"{objects} object{'' if objects == 1 else 's'}"
+        console.say(f"{self.name}: {done} frames, {found}, {done / max(seconds, 1e-9):.1f} frames per second")
 
     def _info(self, done: int) -> dict[str, Any]:
         """What info.json says; notes go to the terminal too."""
