@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import importlib
 import importlib.metadata
 import os
@@ -26,8 +25,8 @@ def load_pybullet() -> Any:
         SimError: PyBullet is not installed.
     """
     try:
-        if "pybullet" in sys.modules:
-            return sys.modules["pybullet"]
+        if (loaded := sys.modules.get("pybullet")) is not None:
+            return loaded
         with _no_output():
             return importlib.import_module("pybullet")
     except ImportError as error:
@@ -38,19 +37,18 @@ def load_pybullet() -> Any:
 
 @contextlib.contextmanager
 def _no_output() -> Iterator[None]:
-    """Drops what C code prints: PyBullet prints when it was built, among the results of commands that others read."""
+    """Drops what C code writes to standard error: PyBullet tells there when it was built, among a command's messages."""
     try:
-        kept = os.dup(1)
-    except OSError:  # standard output is closed
+        kept = os.dup(2)
+    except OSError:  # it is closed
         yield
         return
     with open(os.devnull, "wb") as nowhere:
-        os.dup2(nowhere.fileno(), 1)
+        os.dup2(nowhere.fileno(), 2)
         try:
             yield
         finally:
-            ctypes.CDLL(None).fflush(None)  # else it would be printed when the process ends
-            os.dup2(kept, 1)
+            os.dup2(kept, 2)
             os.close(kept)
 
 

@@ -9,4 +9,4 @@ import sys
 def test_loading_pybullet_prints_nothing_and_keeps_what_others_print() -> None:
     code = "print('before'); from sims.bullet import load_pybullet; load_pybullet(); print('after')"
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
-    assert (ended.returncode, ended.stdout) == (0, "before\nafter\n"), ended.stderr
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "before\nafter\n", "")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import signal
 import time
 import traceback
@@ -43,8 +42,6 @@ def perceive_of(setting: Setting) -> Perceive:
 def serve(connection: Connection, setting: Setting) -> None:
     """Receives a `Task`, answers with an `Answer`, until the parent closes the connection or ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its workers
-    with open(os.devnull, "w") as nowhere:
-        os.dup2(nowhere.fileno(), 1)  # PyBullet greets there
     torch.set_num_threads(1)
     perceive: Perceive | None = None
     with suppress(EOFError, BrokenPipeError, ConnectionResetError):

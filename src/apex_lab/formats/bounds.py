@@ -30,7 +30,7 @@ def at_most(gigabytes: float) -> Iterator[None]:
         _bound.reset(token)
 
 
-def check_shape(shape: Sequence[int], itemsize: int, where: str) -> None:
+def check_shape(shape: Sequence[Any], itemsize: int, where: str) -> None:
     """Compares a declared shape with the bound.
 
     Args:
@@ -41,7 +41,7 @@ def check_shape(shape: Sequence[int], itemsize: int, where: str) -> None:
     Raises:
         UserError: it is too large, or no shape.
     """
-    if any(type(length) is not int or length < 0 for length in shape):
+    if any(type(length) is not int or length < 0 for length in shape):  # as a file of others has it
         raise UserError(f"{where}: {list(shape)} is no size; want whole numbers from 0 on")
     check_bytes(math.prod(shape) * itemsize, f"{where}: an array of {' x '.join(map(str, shape))}")
 
