@@ -37,7 +37,7 @@ def load_pybullet() -> Any:
 
 @contextlib.contextmanager
 def _no_output() -> Iterator[None]:
-    """Drops what C code writes to standard error: PyBullet tells there when it was built, among a command's messages."""
+    """Drops what C code writes to standard error: PyBullet tells there when it was built."""
     try:
         kept = os.dup(2)
     except OSError:  # it is closed
