@@ -30,11 +30,11 @@ def at_most(gigabytes: float) -> Iterator[None]:
         _bound.reset(token)
 
 
-def check_shape(shape: Sequence[int], itemsize: int, where: str) -> None:
+def check_shape(shape: Sequence[Any], itemsize: int, where: str) -> None:
     """Compares a declared shape with the bound.
 
     Args:
-        shape: lengths of all axes.
+        shape: lengths of all axes, as they are declared.
         itemsize: bytes of an element.
         where: file and video, for the message.
 
