@@ -34,7 +34,7 @@ def check_shape(shape: Sequence[Any], itemsize: int, where: str) -> None:
     """Compares a declared shape with the bound.
 
     Args:
-        shape: lengths of all axes.
+        shape: lengths of all axes, as they are declared.
         itemsize: bytes of an element.
         where: file and video, for the message.
 
