@@ -189,7 +189,7 @@ def check_job(
     except UserError as error:
         ablations.explain(str(error), choices, conf_dir())
         raise
-    limits.refuse_large_batches(raw, _longest_clip(config))
+    limits.refuse_large_batches(config.model_dump(), _longest_clip(config))
     _check_splits(config)
     _check_cuda_graph(config.trainer)
     return Job(config, raw, dict(choices), tuple(overrides))
