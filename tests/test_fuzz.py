@@ -6,12 +6,14 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.conftest import TINY, Ended
+from tests.conftest import REPOSITORY, TINY, Ended
 
 SECONDS = 20.0
 """Of processor time; a machine that does other things beside is not the command's fault."""
@@ -125,6 +127,37 @@ def test_every_model(
     model: str, words: list[str], command: Callable[..., Ended], no_work: None, tmp_path: Path
 ) -> None:
     ends_well(command, "train", [f"model={model}", "data=sprites", "scale=smoke", *words], tmp_path)
+
+
+def keys_of(file: Path) -> list[str]:
+    """The keys that a command's own file sets, dotted."""
+
+    def inside(content: dict[str, Any], prefix: str = "") -> list[str]:
+        found = []
+        for key, value in content.items():
+            if prefix or key not in ("defaults", "hydra"):
+                found += [f"{prefix}{key}", *(inside(value, f"{prefix}{key}.") if isinstance(value, dict) else [])]
+        return found
+
+    return inside(yaml.safe_load(file.read_text()))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("entry", ["evaluate", "predict", "compare", "arrange", "tables.asked", "report.asked"])
+@cases(30)
+@given(data=st.data())
+def test_keys_of_a_command_s_own(
+    entry: str, data: st.DataObject, command: Callable[..., Ended], tmp_path: Path
+) -> None:
+    keys = keys_of(REPOSITORY / "conf" / f"{entry.partition('.')[0]}.yaml")
+    values = (*VALUES, str(tmp_path), "/etc/passwd", "apex-p2d-cpu", "[x,y]", "*")
+    own = st.builds(
+        lambda sign, key, value: f"{sign}{key}={value}",
+        st.sampled_from(("", "", "++")),
+        st.sampled_from(keys),
+        st.sampled_from(values),
+    )
+    ends_well(command, entry, data.draw(st.lists(st.one_of(own, own, own, word), min_size=1, max_size=4)), tmp_path)
 
 
 @pytest.mark.slow

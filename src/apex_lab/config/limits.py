@@ -132,7 +132,7 @@ def refuse_large_batches(config: Mapping[str, Any], clip_frames: int | None) -> 
         _refuse(4 * clips * pixels, f"a batch of {clips:,} frames", "clips.batch_size", config, sizes)
         asked = config["evaluation"]
         whole = asked["batch_size"] * frames  # videos are whole until they are cut into chunks; pixels are bytes then
-        size = whole * pixels + 4 * asked["batch_size"] * min(frames, asked.get("chunk") or frames) * pixels
+        size = whole * pixels + 4 * asked["batch_size"] * min(frames, asked["chunk"] or frames) * pixels
         _refuse(size, f"{whole:,} frames of whole videos", "evaluation.batch_size", config, sizes)
     for split in ("train", "val", "test"):
         if (videos := _count(data.get(split))) is not None:
