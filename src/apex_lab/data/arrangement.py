@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import validate
+from apex_lab.base.validation import PathText, validate
 from apex_lab.data.recorded import RecordedSet, RecordedSource, Verify
 from apex_lab.metrics.objects import ObjectMetadata
 from recordings import Plan
@@ -62,7 +62,7 @@ class ArrangementSource(RecordedSource):
 
     def __init__(
         self,
-        root: str,
+        root: PathText,
         data_seed: Annotated[int, Field(ge=0)] = 0,
         train: Annotated[int, Field(gt=0)] = 2000,
         val: Annotated[int, Field(ge=0)] = 200,

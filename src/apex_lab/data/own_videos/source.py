@@ -12,6 +12,7 @@ from pydantic import Field
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
+from apex_lab.base.validation import PathText
 from apex_lab.data.own_videos import cutting
 from apex_lab.data.own_videos.cutting import SPLITS, SplitBy
 from apex_lab.data.own_videos.maker import KIND, ClipMaker, Settings, clips_of, cut_of, plan_of
@@ -56,7 +57,7 @@ class OwnVideosSource(RecordedSource):
 
     def __init__(
         self,
-        root: str,
+        root: PathText,
         path: str | None = None,
         train: Annotated[int, Field(gt=0)] = 2000,
         val: Annotated[int, Field(gt=0)] = 200,

@@ -10,6 +10,7 @@ from pydantic import Field
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
+from apex_lab.base.validation import PathText
 from apex_lab.data.recorded import Verify, refuse_damage, told
 from apex_lab.data.sketchy.recording import COMMAND, KIND, recording_folder
 from apex_lab.data.sketchy.split import SPLITS
@@ -42,7 +43,7 @@ class SketchySource(VideoSource):
 
     def __init__(
         self,
-        root: str,
+        root: PathText,
         name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]+$")] = "demos",
         frames: Annotated[int, Field(gt=0)] = 10,
         stride: Annotated[int, Field(ge=1, le=5)] = 1,
