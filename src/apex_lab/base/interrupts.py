@@ -57,6 +57,11 @@ def asked() -> int | None:
     return _state.signum
 
 
+def answered() -> None:
+    """Forgets the request: it asked for no more than what has been done, as Ctrl-C ends a camera's endless video."""
+    _state.signum = None
+
+
 def check() -> None:
     """A safe point: stops if that was asked for and the work at hand is not deferring it.
 

@@ -129,7 +129,7 @@ class VideoPrediction:
 
         Raises:
             UserError: a frame cannot be read, the disk is full, ...
-            Interrupted: asked to stop; what was done is stored. The results of a camera are finished first.
+            Interrupted: asked to stop; what was done is stored. A camera's video ends instead, with its results.
         """
         if again or self.video.live:
             self.journal.clear()
@@ -142,6 +142,8 @@ class VideoPrediction:
                 if not ended:
                     return self.place  # leaving `deferring` stops
             self._finish(done, time.monotonic() - began)
+            if self.video.live:
+                interrupts.answered()  # a request to stop is how a camera's video ends
         return self.place
 
     def _outputs(self) -> list[Output]:
@@ -182,7 +184,6 @@ class VideoPrediction:
         total = None if announced is None else math.ceil(announced / self.wanted.every)
         if self.wanted.frames is not None:
             total = self.wanted.frames if total is None else min(total, self.wanted.frames)
-        scenes = self._scenes(done, state)
         scenes = self._scenes(done, state)
         upcoming = next(scenes, None)
         with Meter(f"{self.name}: frame", total, done) as meter:
