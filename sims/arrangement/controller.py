@@ -83,7 +83,7 @@ class Controller:
         """A sub-task that can be planned: a retry, an object whose target is free, an object to put aside.
 
         Raises:
-            Exhausted: the planner may try no more.
+            Exhausted: the planner may compare no more.
         """
         retry = self._retry()
         if retry is not None:

@@ -60,7 +60,9 @@ def run(scenario: Scenario, perceive: Perceive, settings: Settings, on_frame: On
             view = camera.view(names, cell.world.poses(), cell.world.joints())
             scene = controller.progress.scene
             seen = () if scene is None else scene.detections
-            on_frame(Frame(cell.time_s, view, goal.view, seen, goal.detections, _numbers(controller.progress), notes[0]))
+            on_frame(
+                Frame(cell.time_s, view, goal.view, seen, goal.detections, _numbers(controller.progress), notes[0])
+            )
 
     if on_frame is not None:
         cell.on_step = film

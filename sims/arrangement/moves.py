@@ -58,7 +58,7 @@ class Picking:
         """The first pick and place, from the retracted arm and back, that touches nothing else; None: there is none.
 
         Raises:
-            Exhausted: the planner may try no more.
+            Exhausted: the planner may compare no more.
         """
         for pick in self._picks():
             for release in releases(self.body, pick.grasp, target):
