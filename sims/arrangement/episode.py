@@ -11,6 +11,7 @@ from sims.arrangement.cell import Cell
 from sims.arrangement.controller import Controller
 from sims.arrangement.judge import Judge
 from sims.arrangement.planner import Planner
+from sims.arrangement.progress import Progress
 from sims.arrangement.scenario import Placement, Scenario
 from sims.arrangement.scene import Scene, see
 from sims.arrangement.settings import Settings
@@ -29,7 +30,7 @@ def run(scenario: Scenario, perceive: Perceive, settings: Settings, on_frame: On
     Raises:
         ValueError: `perceive` returned a mask of another shape than its image.
     """
-    cell, camera = _cell(os.getpid()), studio(settings)
+    cell, planner, camera = _cell(os.getpid()), _planner(os.getpid()), studio(settings)
     goal_names, goal_poses = _load(cell, scenario.goal)
     goal_view = camera.view(goal_names, goal_poses)
     goal = see(goal_view, perceive(goal_view), settings)
@@ -41,10 +42,11 @@ def run(scenario: Scenario, perceive: Perceive, settings: Settings, on_frame: On
         view = camera.view(names, cell.world.poses(), cell.world.joints())
         return see(view, perceive(view), settings)
 
+    planner.begin(settings.planning_limit * len(names))
     controller = Controller(
         settings,
         cell,
-        _planner(os.getpid()),
+        planner,
         goal,
         look,
         limit_s=settings.time_limit_s * len(names),
@@ -56,10 +58,11 @@ def run(scenario: Scenario, perceive: Perceive, settings: Settings, on_frame: On
         if steps % max(1, STEPS_PER_S // settings.video_fps) == 0:
             assert on_frame is not None
             view = camera.view(names, cell.world.poses(), cell.world.joints())
-            scene = controller.scene
-            matches = () if scene is None else tuple(_numbers(controller, scene))
+            scene = controller.progress.scene
             seen = () if scene is None else scene.detections
-            on_frame(Frame(cell.time_s, view, goal.view, seen, goal.detections, matches, notes[0]))
+            on_frame(
+                Frame(cell.time_s, view, goal.view, seen, goal.detections, _numbers(controller.progress), notes[0])
+            )
 
     if on_frame is not None:
         cell.on_step = film
@@ -69,7 +72,7 @@ def run(scenario: Scenario, perceive: Perceive, settings: Settings, on_frame: On
     return Outcome(
         task=scenario.task,
         index=scenario.index,
-        objects=judge.objects(cell.world.poses(), goals, controller, ended),
+        objects=judge.objects(cell.world.poses(), goals, controller.progress, ended),
         subtasks=tuple(judge.subtask(attempt, goal) for attempt in controller.finished),
         time_s=cell.time_s,
         ended=ended,
@@ -82,9 +85,10 @@ def _load(cell: Cell, placements: tuple[Placement, ...]) -> tuple[tuple[str, ...
     return tuple(placement.name for placement in placements), cell.world.poses()
 
 
-def _numbers(controller: Controller, scene: Scene) -> list[tuple[int, int]]:
+def _numbers(progress: Progress) -> tuple[tuple[int, int], ...]:
     """The matches as indices of detections."""
-    return [(scene.items[item].number, controller.goal.items[goal].number) for item, goal in controller.matches]
+    scene, goals = progress.scene, progress.goal.items
+    return tuple((scene.items[item].number, goals[goal].number) for item, goal in progress.matches if scene is not None)
 
 
 @lru_cache(maxsize=1)

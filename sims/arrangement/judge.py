@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sims.arrangement.controller import Attempt, Controller
+from sims.arrangement.progress import Attempt, Progress
 from sims.arrangement.scenario import Placement
 from sims.arrangement.scene import Scene
 from sims.arrangement.settings import Settings
@@ -79,7 +79,7 @@ class Judge:
         )
 
     def objects(
-        self, poses: np.ndarray, goals: dict[str, np.ndarray], controller: Controller, ended: Ended
+        self, poses: np.ndarray, goals: dict[str, np.ndarray], progress: Progress, ended: Ended
     ) -> tuple[ObjectOutcome, ...]:
         """Outcomes of the objects that have a goal.
 
@@ -94,7 +94,7 @@ class Judge:
             off = _off_table(poses[number])
             distance = OFF_M if off else float(np.linalg.norm(poses[number, :2] - goals[name][:2]))
             failed = distance > self.settings.failed_m
-            why = self._reason(number, off or self._tipped(poses, number), controller, ended) if failed else None
+            why = self._reason(number, off or self._tipped(poses, number), progress, ended) if failed else None
             found.append(ObjectOutcome(name, distance, why))
         return tuple(found)
 
@@ -102,13 +102,13 @@ class Judge:
         turn = Rotation.from_quat(poses[number, 3:]) * Rotation.from_quat(self.start[number, 3:]).inv()
         return bool(turn.apply([0.0, 0.0, 1.0])[2] < np.cos(TIPPED_RAD))
 
-    def _reason(self, number: int, fell: bool, controller: Controller, ended: Ended) -> Reason:
+    def _reason(self, number: int, fell: bool, progress: Progress, ended: Ended) -> Reason:
         name, log = self.names[number], self.logs[number]
-        goal, scene = controller.goal, controller.scene
+        goal, scene = progress.goal, progress.scene
         assert scene is not None
         goal_item = _showing(goal, name)
         item = _showing(scene, name)
-        pairs = dict(controller.matches)
+        pairs = dict(progress.matches)
         if fell:
             return "fell"
         if goal_item is None or item is None:
@@ -125,7 +125,8 @@ class Judge:
 
 
 def _off_table(pose: np.ndarray) -> bool:
-    return bool(pose[2] < 0 or (pose[:2] < TABLE_LOW_M).any() or (pose[:2] > TABLE_HIGH_M).any())
+    on = pose[2] >= 0 and (pose[:2] >= TABLE_LOW_M).all() and (pose[:2] <= TABLE_HIGH_M).all()
+    return not on
 
 
 def _showing(scene: Scene, name: str) -> int | None:

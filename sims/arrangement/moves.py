@@ -55,7 +55,11 @@ class Picking:
         self._more = self._search()
 
     def to(self, target: Body) -> Plan | None:
-        """The first pick and place, from the retracted arm and back, that touches nothing else; None: there is none."""
+        """The first pick and place, from the retracted arm and back, that touches nothing else; None: there is none.
+
+        Raises:
+            Exhausted: the planner may compare no more.
+        """
         for pick in self._picks():
             for release in releases(self.body, pick.grasp, target):
                 placed = self._place(pick, release)
@@ -83,6 +87,7 @@ class Picking:
 
     def _pick(self, grasp: Grasp) -> _Pick | None:
         planner, above = self.planner, grasp.point + ABOVE
+        planner.go_on()
         start = planner.reach(above, grasp.yaw)
         if start is None:
             return None
@@ -98,6 +103,7 @@ class Picking:
     def _place(self, pick: _Pick, release: Grasp) -> Plan | None:
         """Lift, carry, lower, retreat and home; None if one of them is not free."""
         planner, grasp, width = self.planner, pick.grasp, pick.grasp.width / 2
+        planner.go_on()
         if planner.reach(release.point, release.yaw) is None:
             return None
         up = np.array([0.0, 0.0, max((other.height for other in self.others), default=0.0) + OVER_M])

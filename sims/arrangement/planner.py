@@ -32,8 +32,16 @@ FIRST_LINK = 3
 FAR_M = 10.0
 
 
+class Exhausted(Exception):
+    """The planner has made as many comparisons as it may in this episode."""
+
+
 class Planner:
-    """Inverse kinematics and collision checks."""
+    """Inverse kinematics and collision checks.
+
+    Its work is counted in comparisons rather than seconds, so that an outcome does not depend on the machine: one for
+    every inverse kinematics, and for every body that a configuration of the arm is compared with.
+    """
 
     def __init__(self) -> None:
         self.bullet = Client()
@@ -43,7 +51,21 @@ class Planner:
         self.table = self._box([*half, 0.05], [*middle, -0.05], 0.0)
         self.boxes: list[int] = []
         self.held = -1
+        self.compared, self.limit = 0, 0
         self._held_at = (np.zeros(3), 0.0)
+
+    def begin(self, limit: int) -> None:
+        """Start an episode with a limit to the comparisons."""
+        self.compared, self.limit = 0, limit
+
+    def go_on(self) -> None:
+        """Called before every piece of planning.
+
+        Raises:
+            Exhausted: the limit is reached.
+        """
+        if self.compared >= self.limit:
+            raise Exhausted
 
     def show(self, bodies: Sequence[Body]) -> None:
         """Replace the obstacles."""
@@ -79,6 +101,7 @@ class Planner:
             yaw: of the hand in radians; the fingers open perpendicular to it.
             seed: angles to start from; None: the arm at rest, turned towards the point.
         """
+        self.compared += 1
         down = self.bullet.call("getQuaternionFromEuler", (np.pi, 0.0, yaw))
         if seed is None:
             seed = np.array(panda.REST_RAD)
@@ -137,6 +160,7 @@ class Planner:
 
     def free(self, angles: np.ndarray, fingers: float = OPEN_M) -> bool:
         """Whether the arm, and what it holds, keep clear of all bodies."""
+        self.compared += 1 + len(self.boxes)
         self._pose(angles, fingers)
         call = self.bullet.call
         table = call("getClosestPoints", self.arm, self.table, TABLE_CLEAR_M)

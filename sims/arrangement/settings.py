@@ -49,6 +49,9 @@ class Settings(BaseModel):
     """Attempts at bringing one object to its goal."""
     time_limit_s: float = Field(default=60.0, gt=0)
     """Simulated seconds per object of the scenario, after which no further sub-task is started."""
+    planning_limit: int = Field(default=10_000, ge=1)
+    """Comparisons of the planner (`planner.Planner`) per object of the scenario, after which no further sub-task is
+    planned. The oracle needs up to 1,500; dozens of false detections would need very many."""
     reached_m: float = Field(default=0.02, gt=0, le=0.1)
     """An object seen this near its goal is not moved again."""
     failed_m: float = Field(default=0.05, gt=0, le=0.5)

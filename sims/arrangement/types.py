@@ -33,12 +33,12 @@ fell: it lies off the table or has tipped over.
 collided: it was moved while another object was being handled.
 no path: no collision-free motion of the arm was found.
 misplaced: put down away from its goal.
-out of time: the episode's time was spent.
+out of time: the episode's simulated time, or what the planner may compare, was spent.
 """
 
 Ended = Literal["arranged", "nothing detected", "stuck", "out of time"]
 """How an episode ended: every object that has a match is at its goal; there is, or was left, no pair of a current and a
-goal detection; no possible sub-task was left; simulated time was spent."""
+goal detection; no possible sub-task was left; simulated time, or what the planner may compare, was spent."""
 
 
 @dataclass(frozen=True)

@@ -101,6 +101,9 @@ def check_arrangement(raw: dict[str, Any], choices: Mapping[str, str], overrides
         raise UserError(f"perception._target_ = {shown(asked.perception['_target_'])} is no Perception.")
     name = choices.get("perception", TRAINED)
     videos = tuple(_film(text, asked, world) for text in asked.video)
+    for key, values in (("tasks", asked.tasks), ("video", videos)):
+        if len(set(values)) < len(values):
+            raise UserError(f"{key} = {shown(getattr(asked, key))} names one twice: name each once.")
     if not perception.needs_checkpoint:
         if asked.checkpoint is not None:
             raise UserError(f"perception={name} needs no checkpoint: leave one of the two out.")
@@ -198,7 +201,8 @@ def _of_file(job: Arrangement, file: Path) -> Benchmark:
     early = (content["training"] or {}).get("ended", False)
     learns = config.build_model(trained.config).needs_training
     ended = early or content["step"] >= trained.config.trainer.max_steps or not learns
-    usual = (asked.tasks, asked.scenarios, asked.seed, job.world) == (TASKS, SCENARIOS, SEED, Settings())
+    usual = (tuple(sorted(asked.tasks)), asked.scenarios, asked.seed) == (TASKS, SCENARIOS, SEED)
+    usual &= job.world == Settings()
     usual &= components.build(asked.perception, "perception") == Trained()
     words = [trained.choices["model"], *([file.stem] if not in_run or file.name != "last.ckpt" or not ended else [])]
     if asked.folder is not None:

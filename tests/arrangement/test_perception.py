@@ -65,6 +65,14 @@ def test_what_is_absent_empty_or_background_is_no_detection() -> None:
     assert [one.mask[0].tolist() for one in found] == [[False, True, False, False], [False, False, True, True]]
 
 
+def test_objects_without_numbers_are_absent() -> None:
+    masks = [[0.3, 0.3, 0.3], [0.4, 0.1, 0.4], [float("nan"), 0.5, 0.1], [0.3, 0.1, 0.5]]
+    found = detections(scene(masks, [1.0, 0.9, 1.0, float("nan")], [0, 7, 8, 9]), 0.0)
+    assert [one.mask[0].tolist() for one in found] == [[True, False, True]]
+    broken = [[float("nan")] * 3] * 4
+    assert detections(scene(broken, [1.0] * 4, [0, 7, 8, 9]), 0.5) == []
+
+
 def test_yardsticks_find_the_squares() -> None:
     clusters = Untrained(ColorClusters(colors=3)).ready(None, torch.device("cpu"))
     green, red = clusters(view())  # the larger one first

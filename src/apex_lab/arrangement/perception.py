@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -50,7 +50,7 @@ class Oracle(Perception):
         return oracle.perceive
 
 
-@dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True)
 class Trained(Perception):
     """The model of a checkpoint.
 
@@ -147,8 +147,11 @@ def detections(scene: Scene, min_presence: float) -> list[Detection]:
         min_presence: objects below are absent.
 
     Returns:
-        One detection per object that is present and wins a pixel; masks do not overlap.
+        One detection per object that is present and wins a pixel; masks do not overlap. An object whose presence or
+        mask is not finite is absent.
     """
+    broken = ~scene.masks.isfinite().all(dim=-1).all(dim=-1) | ~scene.presence.isfinite()
+    scene = dataclasses.replace(scene, presence=scene.presence.masked_fill(broken, -1.0))
     ids, presence = scene.ids[0, 0].cpu(), scene.presence[0, 0].float().cpu().numpy()
     appearance = scene.appearance[0, 0].float().cpu().numpy()
     winner = scene.segmentation(min_presence)[0, 0].cpu()

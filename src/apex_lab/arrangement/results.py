@@ -11,8 +11,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
+import scipy
+
 import sims
 from apex_lab import inference, models, nn
+from apex_lab import scene as contract
 from apex_lab.arrangement.task import Setting, Task
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, read_json, write_json, write_text
@@ -37,7 +41,7 @@ def identity(setting: Setting) -> str:
             "device": setting.device,
             "world": setting.world.model_dump(mode="json"),
             "seed": setting.seed,
-            "versions": provenance.versions(),
+            "versions": {**provenance.versions(), "scipy": scipy.__version__, "opencv": cv2.__version__},
             "code": _code(),
         }
     )
@@ -51,7 +55,7 @@ def _code() -> str:
     """SHA-256 of the code that can change an outcome: the simulator, models and perception, no tests and no pages."""
     folders = [Path(package.__path__[0]) for package in (sims, models, nn, inference)]
     files = [file for folder in folders for file in sorted(folder.rglob("*.py"))]
-    files.append(Path(__file__).with_name("perception.py"))
+    files += [Path(__file__).with_name("perception.py"), Path(contract.__file__)]
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 

@@ -10,9 +10,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from apex_lab.base.errors import UserError
 from apex_lab.base.validation import PathText, validate
-from apex_lab.data.recorded import RecordedSet, RecordedSource, Verify
+from apex_lab.data.recorded import RecordedSet, RecordedSource, Verify, merged
 from apex_lab.metrics.objects import ObjectMetadata
 from recordings import Plan
 from sims.arrangement_clips.recording import KIND, Clips, make, plan
@@ -77,13 +76,7 @@ class ArrangementSource(RecordedSource):
     ) -> None:
         super().__init__(workers, generate, sim_workers, verify)
         sizes = {"train": train, "val": val, "test": test, "frames": frames, "image_size": image_size}
-        fixed, further = {"seed": data_seed, **sizes}, dict(simulation or {})
-        for key in further:
-            if key in fixed:
-                raise UserError(
-                    f"simulation.{key} is not a key: set data.{'data_seed' if key == 'seed' else key} instead"
-                )
-        settings = validate(Settings, {**fixed, **further}, "simulation")
+        settings = validate(Settings, merged({"seed": data_seed, **sizes}, simulation), "simulation")
         assert isinstance(settings, Settings)
         self.settings = settings
         name = f"arrangement_{image_size}px_{frames}f_{self.plan().fingerprint[:8]}"

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import PathText
 from apex_lab.data.p2d import P2D
-from apex_lab.data.recorded import RecordedSource, Verify
+from apex_lab.data.recorded import RecordedSource, Verify, merged
 from recordings import Plan
 from sims.p2d.generate import SIMULATOR, Simulator, generate
 from sims.p2d.settings import Settings
@@ -62,7 +62,7 @@ class P2DSource(RecordedSource):
         verify: Verify = "changed",
     ) -> None:
         sizes = {"train": train, "val": val, "test": test, "frames": frames, "image_size": image_size}
-        self.settings = _settings({"seed": data_seed, **sizes}, simulation or {})
+        self.settings = _settings(merged({"seed": data_seed, **sizes}, simulation))
         super().__init__(workers, generate, sim_workers, verify)
         name = f"p2d_{image_size}px_{frames}f_{self.plan().fingerprint[:8]}"
         self._folder = Path(root).expanduser().absolute() / name
@@ -93,13 +93,9 @@ class P2DSource(RecordedSource):
         return P2D(self.folder, split)
 
 
-def _settings(fixed: dict[str, Any], further: Mapping[str, Any]) -> Settings:
-    for key in further:
-        if key in fixed:
-            word = "data_seed" if key == "seed" else key
-            raise UserError(f"simulation.{key} is not a key: set data.{word} instead")
+def _settings(values: Mapping[str, Any]) -> Settings:
     try:
-        return Settings(**fixed, **_plain(further))
+        return Settings(**_plain(values))
     except ValidationError as error:
         raise UserError(sentence(error)) from None
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -49,6 +49,24 @@ def refuse_damage(folder: Path, manifest: Manifest[Any], when: Verify, command: 
             lines = damage.lines()
             more = f" and {len(lines) - 1} more" if len(lines) > 1 else ""
             raise UserError(f"{folder} is damaged ({lines[0]}{more}): repair it with {command}")
+
+
+def merged(fixed: Mapping[str, Any], simulation: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Values of the settings of simulated data.
+
+    Args:
+        fixed: those that are keys of `data`; `seed` is `data.data_seed`.
+        simulation: the further ones.
+
+    Raises:
+        UserError: one is given in both.
+    """
+    further = dict(simulation or {})
+    for key in further:
+        if key in fixed:
+            word = "data_seed" if key == "seed" else key
+            raise UserError(f"simulation.{key} is not a key: set data.{word} instead")
+    return {**fixed, **further}
 
 
 class RecordedSet(VideoSet):

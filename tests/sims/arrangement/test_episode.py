@@ -97,11 +97,29 @@ def test_one_object_is_never_detected() -> None:
     assert outcome.objects[1].distance_m < 0.02 or outcome.ended == "stuck"
 
 
-def test_a_mask_over_two_objects() -> None:
+def test_objects_that_stand_on_each_other_s_targets() -> None:
+    """One goes to the edge, the other home, then the first one home."""
+    goal = draw(0, 2, 0, SETTINGS).goal
+    places = [each.position[:2] for each in reversed(goal)]
+    current = tuple(
+        dataclasses.replace(each, position=(*place, each.position[2])) for each, place in zip(goal, places, strict=True)
+    )
+    outcome = episode.run(Scenario(0, 2, 0, goal, current), oracle.perceive, SETTINGS)
+    assert outcome.ended == "arranged"
+    assert max(each.distance_m for each in outcome.objects) < 0.02
+    assert [each.kind for each in outcome.subtasks] == ["aside", "home", "home"]
+    first, second, third = [each.object for each in outcome.subtasks]
+    assert first == third != second
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_mask_over_two_objects(first: int) -> None:
+    """In the goal image too; in the current images alone."""
+
     def joined(found: list[Detection]) -> list[Detection]:
         return [dataclasses.replace(found[0], mask=np.any([each.mask for each in found], axis=0))]
 
-    outcome = _run(_then(joined))
+    outcome = _run(_then(joined, first))
     assert "missed detection" in _reasons(outcome)
 
 
@@ -136,6 +154,15 @@ def test_more_objects_in_the_goal_than_on_the_table() -> None:
     scenario = Scenario(0, 3, 0, whole.goal, whole.current[1:2])
     outcome = episode.run(scenario, oracle.perceive, SETTINGS)
     assert [each.name for each in outcome.objects] == [whole.current[1].name]
+    assert outcome.ended == "arranged"
+    assert outcome.objects[0].distance_m < 0.02
+
+
+def test_more_objects_on_the_table_than_in_the_goal() -> None:
+    whole = draw(0, 3, 0, SETTINGS)
+    scenario = Scenario(0, 3, 0, whole.goal[1:2], whole.current)
+    outcome = episode.run(scenario, oracle.perceive, SETTINGS)
+    assert [each.name for each in outcome.objects] == [whole.goal[1].name]
     assert outcome.ended == "arranged"
     assert outcome.objects[0].distance_m < 0.02
 
