@@ -74,6 +74,27 @@ class Video(ABC):
     def stamp(self) -> str:
         """32 hex digits that change when the file changes (its path, size and time of writing)."""
 
+    def cut_off(self, frames: int, last: float) -> str | None:
+        """What to say where clearly less could be read than the file announces; None where it is whole.
+
+        Many files announce a duration alone. Its frames are then counted at one rate, which is wrong for videos of a
+        variable rate; so what counts is how far the times reach.
+
+        Args:
+            frames: how many were read, up to the end.
+            last: time of the last of them, in seconds.
+        """
+        if self.announced is None or frames >= self.announced:
+            return None
+        if self.fps is not None:
+            wanted = self.announced / self.fps
+            if last + 1 / self.fps >= wanted - max(2 / self.fps, 0.1, 0.01 * wanted):
+                return None
+        return (
+            f"it announces {self.announced} frames, and {frames} could be read: it may be cut off or damaged "
+            "(a trimmed video and longer sound announce too many, too)"
+        )
+
 
 def open_video(source: Source | str) -> Video:
     """A video of any kind; its first frame is read, to see that it can be.
