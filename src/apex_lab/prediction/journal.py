@@ -116,7 +116,7 @@ class Journal:
             if any(_sizes(part) != sizes for part, sizes in zip(parts, closed, strict=False)):
                 return None
             tensors = torch.load(self._state(len(closed)), weights_only=True)
-            return Entry(*(content[name] for name in ("done", "ended", "time", "reader")), tensors)
+            return Entry(content["done"], content["ended"], content["time"], content["reader"], tensors)
         except Exception:  # noqa: BLE001 - what is raised for damaged bytes has no common class
             return None
 
