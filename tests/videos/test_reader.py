@@ -140,6 +140,8 @@ def test_nothing_is_printed_about_a_damaged_file(tmp_path: Path, capfd: pytest.C
     (tmp_path / "text.mp4").write_text("hello\n")
     with pytest.raises(UserError):
         open_video(tmp_path / "text.mp4")
+    with pytest.raises(UserError, match="Camera 97 gives no picture"):
+        open_video(97)
     assert capfd.readouterr() == ("", "")
 
 

@@ -155,12 +155,7 @@ class VideoFile(Video):
         return _stamp([Path(str(self.source))])
 
     def _capture(self) -> cv2.VideoCapture:
-        level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        try:
-            return cv2.VideoCapture(str(self.source), cv2.CAP_FFMPEG)
-        finally:
-            cv2.utils.logging.setLogLevel(level)
+        return _opened(str(self.source), cv2.CAP_FFMPEG)
 
 
 class _Clock:
@@ -232,7 +227,7 @@ class Camera(Video):
 
     def __init__(self, number: int) -> None:
         self.source, self.name = number, f"camera_{number}"
-        self._capture = cv2.VideoCapture(number)
+        self._capture = _opened(number)
         self._first = _next(self._capture)
         if self._first is None:
             self._capture.release()
@@ -257,6 +252,16 @@ class Camera(Video):
 
     def stamp(self) -> str:
         return hashlib.sha256(self.name.encode()).hexdigest()[:32]
+
+
+def _opened(*what: Any) -> Any:
+    """A `cv2.VideoCapture`, opened without OpenCV's own messages: what is wrong is said here in one sentence."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.VideoCapture(*what)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def _next(capture: Any) -> UInt8[np.ndarray, "H W 3"] | None:
