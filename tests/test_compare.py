@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,12 +34,46 @@ def test_models_on_own_videos(command: Callable[..., Ended], tmp_path: Path) -> 
     assert (ended.code, ended.err) == (1, f"{EXAMPLE} has no frame 100: give a smaller start.\n")
 
 
+def test_of_many_videos_the_bad_ones_are_named_and_the_others_drawn(
+    command: Callable[..., Ended], tmp_path: Path
+) -> None:
+    (tmp_path / "a.mp4").write_text("no video")
+    shutil.copy(EXAMPLE, tmp_path / "b.mp4")
+    ended = command("compare", "checkpoints=apex-p2d-cpu", "video=*.mp4", "frames=2", "folder=cmp")
+    assert ended.code == 1
+    assert ended.out.splitlines() == ["cmp/b.png", "1 model on 1 clip"]
+    assert ended.err.splitlines() == [
+        "1 of 2 videos were not compared:",
+        "  a.mp4 is no video that can be read, or it holds no frame.",
+    ]
+
+
+def test_clips_that_are_not_there_are_refused_before_any_is_drawn(
+    command: Callable[..., Ended], tmp_path: Path
+) -> None:
+    words = ("checkpoints=apex-p2d-cpu", "data=sprites", "data.test=2", "folder=cmp")
+    ended = command("compare", *words, "clips=[0,2]")
+    assert (ended.code, ended.out, ended.err) == (1, "", "clips holds 2, but there are 2 videos: give 0 to 1.\n")
+    ended = command("compare", *words, "data.val=0", "split=val")
+    assert (ended.code, ended.err) == (1, "split = val holds no video: choose another one.\n")
+    assert not (tmp_path / "cmp").exists()
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         ((), "checkpoints is missing: write 'checkpoints=[a.ckpt, outputs/<run>/seed_0]'."),
         (("checkpoints=[none.ckpt]",), "checkpoint = none.ckpt does not exist: give a .ckpt file or a run folder."),
         (("checkpoints=apex-p2d-cpu", "frames=3"), "frames = 3 goes with video=... alone: leave it out."),
+        (
+            ("checkpoints=apex-p2d-cpu", "clips=[]"),
+            "clips = [] is wrong: input should be a valid integer, or list should have at least 1 item after "
+            "validation, not 0.",
+        ),
+        (
+            ("checkpoints=apex-p2d-cpu", "accelerator=gpu"),
+            "accelerator = 'gpu', but PyTorch finds no CUDA device: use accelerator=cpu or accelerator=auto.",
+        ),
         (
             ("checkpoints=apex-p2d-cpu", "names=[a,b]"),
             "names holds 2 captions for 1 checkpoints: give one for each.",

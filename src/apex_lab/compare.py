@@ -25,10 +25,11 @@ from apex_lab.data import VideoSource
 from apex_lab.evaluation.checkpoint import load
 from apex_lab.evaluation.files import find, look
 from apex_lab.evaluation.other_data import OtherData
-from apex_lab.prediction.comparing import Model, clips_of_set, clips_of_videos, compare_clips
+from apex_lab.prediction.comparing import Cut, Model, clips_of_set, clips_of_videos, compare_clips
 from apex_lab.prediction.load import segmenter_of
 from apex_lab.runs import checkpoints
 from apex_lab.videos import Source, find_videos
+from apex_lab.videos.found import listed
 
 OF_VIDEOS = {"fit": "crop", "start": 0, "every": 1, "frames": 20}
 """Keys of own videos alone, with their defaults."""
@@ -42,7 +43,7 @@ class CompareConfig(BaseModel):
     checkpoints: str | list[str] | None
     names: list[str] | None
     split: Literal["train", "val", "test"]
-    clips: Annotated[int, Field(ge=1)] | list[Annotated[int, Field(ge=0)]]
+    clips: Annotated[int, Field(ge=1)] | Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
     video: str | int | list[str | int] | None
     fit: Literal["crop", "letterbox"]
     start: int = Field(ge=0)
@@ -125,16 +126,27 @@ def compare(job: Comparison) -> None:
     device = config.device(asked.accelerator)
     contents = [checkpoints.load(file, asked.trust) for file in job.files]
     captions = asked.names or _captions(job.files, contents)
-    models = []
+    models, failed = [], dict[Source, str]()
     for file, content, caption in zip(job.files, contents, captions, strict=True):
         segmenter = segmenter_of(file, content, device, asked.fit, labels=asked.video is None)
         models.append(Model(caption, segmenter.predictor, segmenter.input_size))
     if asked.video is not None:
-        clips = clips_of_videos(job.videos, models, asked.fit, asked.start, asked.every, asked.frames)
+        cut = Cut(asked.fit, asked.start, asked.every, asked.frames)
+        clips = clips_of_videos(job.videos, models, cut, failed)
     else:
-        clips = clips_of_set(_source(job).sets[asked.split], asked.clips)
+        videos = _source(job).sets[asked.split]
+        if not len(videos):
+            raise UserError(f"split = {asked.split} holds no video: choose another one.")
+        clips = clips_of_set(videos, asked.clips)
     paths = compare_clips(models, clips, _folder(job), asked.columns)
-    console.say(f"{len(models)} models on {len(paths)} clips")
+    if paths:
+        console.say(f"{_many(len(models), 'model')} on {_many(len(paths), 'clip')}")
+    if failed:
+        raise UserError(listed(failed, len(job.videos), "compared"))
+
+
+def _many(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _source(job: Comparison) -> VideoSource:

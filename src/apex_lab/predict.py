@@ -7,7 +7,6 @@ python -m apex_lab.predict checkpoint=apex-p2d-cpu video=0     a camera, until C
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,16 +15,17 @@ from typing import Any, Literal
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict, Field
 
-from apex_lab.base import console, interrupts
+from apex_lab.base import console, faults, interrupts
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import make_folder, unwritable
-from apex_lab.base.validation import one_line, sentence, validate
+from apex_lab.base.validation import validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import schema as config
 from apex_lab.prediction.load import digest_of, one_file, segmenter_of
 from apex_lab.prediction.work import Wanted, Weights, predict_video, unique_names
 from apex_lab.runs import checkpoints
 from apex_lab.videos import Source, find_videos
+from apex_lab.videos.found import listed
 from apex_lab.view.encoder import ffmpeg
 
 
@@ -138,12 +138,11 @@ def predict(job: Prediction) -> None:
             except UserError as error:
                 failed[source] = str(error)
             except Exception as error:  # noqa: BLE001 - reported here and below; the others must still be done
-                traceback.print_exc()
-                failed[source] = sentence(f"{source}: {type(error).__name__}: {one_line(error)}")
+                failed[source] = faults.told(error, str(source))
             if source in failed and len(job.videos) > 1:
                 console.error(failed[source])
     if failed:
-        raise UserError(_listed(failed, len(job.videos)))
+        raise UserError(listed(failed, len(job.videos), "predicted"))
 
 
 def _folder(job: Prediction, weights: Weights) -> Path:
@@ -166,13 +165,6 @@ def _locked(folder: Path) -> FileLock:
     except OSError as error:
         raise unwritable(folder, error) from error
     return lock
-
-
-def _listed(failed: Mapping[Source, str], count: int) -> str:
-    if count == 1:
-        return next(iter(failed.values()))
-    reasons = [why if str(source) in why else f"{source}: {why}" for source, why in failed.items()]
-    return "\n".join([f"{len(failed)} of {count} videos were not predicted:", *(f"  {why}" for why in reasons)])
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from apex_lab.data.own_videos.maker import Stream
 from recordings import MANIFEST
 from tests.conftest import REPOSITORY, Ended
 from tests.fakes.own_videos import frame, write_pictures, write_video
+from tests.videos.made import encode
 
 SMALL = {"frames": 3, "image_size": 16, "train": 100, "val": 100, "test": 100, "prepare_workers": 0, "workers": 0}
 
@@ -124,6 +125,22 @@ def test_short_and_unreadable_videos_are_named_and_skipped(tmp_path: Path, caplo
     assert facts["source"] == str(root)
 
 
+def test_videos_that_end_early_are_named_and_used(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    root = tmp_path / "videos"
+    root.mkdir()
+    for video in range(2):
+        write_video(root / f"good{video}.mkv", video, 6)
+    noise = np.random.default_rng(0).integers(0, 255, (30, 48, 64, 3), dtype=np.uint8)
+    cut = encode(root / "cut.avi", noise, "-c:v", "ffv1", "-pix_fmt", "bgr0", "-write_index", "0")
+    cut.write_bytes(cut.read_bytes()[: cut.stat().st_size // 2])
+    for _ in range(2):  # also when what was found is known already
+        caplog.clear()
+        source = opened(tmp_path / "data", root)
+        assert "1 of 3 videos end early and are used as far as they go:" in caplog.text
+        assert f"{cut}: it announces 30 frames, and 1" in caplog.text
+    assert len(source.manifest().settings["videos"]) == 3
+
+
 def test_a_folder_without_usable_videos_is_one_sentence(tmp_path: Path, videos: Path):
     with pytest.raises(UserError, match=r"^data.path = .*/nowhere does not exist: give a folder of videos.$"):
         opened(tmp_path, tmp_path / "nowhere")
@@ -181,6 +198,15 @@ def test_a_finished_recording_needs_no_videos(tmp_path: Path, data: OwnVideosSou
     assert again.sets["train"].name(0) == data.sets["train"].name(0)
     with pytest.raises(UserError, match=r"was made with stride = 1 and not 2: set data.stride=1."):
         opened(tmp_path, data.folder, stride=2)
+
+
+def test_without_generate_missing_clips_are_refused_and_nothing_is_written(
+    tmp_path: Path, videos: Path, data: OwnVideosSource
+):
+    with pytest.raises(UserError, match=r"^no finished own_videos data at .*: set data\.generate=true or run python"):
+        opened(tmp_path, videos, generate=False)
+    assert list(tmp_path.iterdir()) == []
+    assert opened(data.root, videos, generate=False).folder == data.folder
 
 
 def test_limits_take_evenly_spaced_clips(tmp_path: Path, videos: Path):

@@ -11,6 +11,7 @@ from apex_lab.config import components
 
 SOURCES = {
     "P2DSource": {},
+    "SpritesSource": {},
     "ArrangementSource": {},
     "SketchySource": {},
     "OwnVideosSource": {"path": "videos"},

@@ -259,7 +259,12 @@ def test_a_folder_of_somebody_else_takes_no_parts(tmp_path: Path) -> None:
     ("root", "trusted", "makes"), [("/data", False, True), ("/x", False, False), ("/x", True, True)]
 )
 def test_a_checkpoint_does_not_choose_where_data_are_made(root: str, trusted: bool, makes: bool) -> None:
-    stored = {"data": {"_target_": "x", "root": root, "generate": True}, "paths": {"data": "/data", "outputs": "o"}}
-    found = files.here(Path("a.ckpt"), stored, PathsPart(outputs="runs", data="mine"), trusted)["data"]
-    assert found["generate"] is makes
-    assert found["root"] == ("mine" if root == "/data" else root)
+    for name in ("P2DSource", "OwnVideosSource", "SpritesSource", "ArrangementSource"):
+        node = {"_target_": f"apex_lab.data.{name}", "root": root}
+        stored = {"data": node, "paths": {"data": "/data", "outputs": "o"}}
+        found = files.here(Path("a.ckpt"), stored, PathsPart(outputs="runs", data="mine"), trusted)["data"]
+        assert found.get("generate", True) is makes
+        assert found["root"] == ("mine" if root == "/data" else root)
+    # what makes nothing has no such key
+    stored["data"] = {"_target_": "apex_lab.data.SketchySource", "root": root}
+    assert "generate" not in files.here(Path("a.ckpt"), stored, PathsPart(outputs="runs", data="mine"), trusted)["data"]

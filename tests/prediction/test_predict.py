@@ -263,7 +263,41 @@ def test_a_video_that_ends_before_its_claim_is_told(
 
     monkeypatch.setattr(VideoFile, "frames", cut)
     info = json.loads((run(clip, tmp_path / "out") / "info.json").read_text())
-    assert info["notes"] == ["the file says that it has 21 frames, and only 9 could be read"]
+    [note] = info["notes"]
+    assert note.startswith("it announces 21 frames, and 9 could be read: it may be cut off")
+
+
+@pytest.mark.parametrize("every", [1, 4])
+def test_the_overlay_of_a_video_of_a_variable_rate_lasts_as_long_as_the_video(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, every: int
+) -> None:
+    slower = ("-vf", "setpts='(N+gte(N,5)*(N-4)*2)/(10*TB)'", "-fps_mode", "vfr")  # 20 frames in 4.9 seconds
+    clip = encode(tmp_path / "clip.mkv", moving(20), *slower, "-c:v", "ffv1", "-pix_fmt", "bgr0")
+    wanted = Wanted(chunk=2, save_interval=2, every=every)
+    with monkeypatch.context() as patched:
+        breaking(patched, 12, kill)
+        with pytest.raises(Broken):
+            run(clip, tmp_path / "out", wanted)
+    folder = run(clip, tmp_path / "out", wanted)  # resumed: the rate is that of all frames
+    frames = list(open_video(folder / "overlay.mp4").frames())
+    assert len(frames) == 20 / every
+    assert frames[-1].time == pytest.approx({1: 4.9, 4: 4.0}[every], abs=0.05)
+    assert json.loads((folder / "info.json").read_text())["notes"] == []
+
+
+@pytest.mark.parametrize("content", ["[]", "{}", '"text"', '{"key": 1}', "the key alone", "other types"])
+def test_a_journal_of_another_content_starts_the_video_again(
+    clip: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str
+) -> None:
+    stopped(monkeypatch, 10, kill, clip, tmp_path / "out")
+    file = tmp_path / "out" / ".clip.part" / "journal.json"
+    before = json.loads(file.read_text())
+    if content == "the key alone":
+        content = json.dumps({"key": before["key"]})
+    elif content == "other types":
+        content = json.dumps({**before, "parts": 3})
+    file.write_text(content)
+    assert json.loads((run(clip, tmp_path / "out") / "info.json").read_text())["frames"] == 21
 
 
 class _Camera(Video):
@@ -300,6 +334,28 @@ def test_videos_of_one_name_have_different_folders() -> None:
 
 
 # --- the command ---
+
+
+def test_a_video_that_fails_for_an_unforeseen_reason_does_not_stop_the_others(
+    command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("a.mkv", "b.mkv"):
+        encode(tmp_path / name, moving(2))
+    whole = VideoFile.frames
+
+    def broken(self: VideoFile, start: int = 0) -> Iterator[Frame]:
+        if self.name == "a":
+            raise ZeroDivisionError("of the decoder")
+        return whole(self, start)
+
+    monkeypatch.setattr(VideoFile, "frames", broken)
+    ended = command("predict", *QUICK, "video=*.mkv")
+    assert ended.code == 1
+    assert "a.mkv: ZeroDivisionError: of the decoder (traceback: " in ended.err
+    assert "Traceback" not in ended.err
+    assert "1 of 2 videos were not predicted:" in ended.err
+    assert (tmp_path / "out" / "b" / "info.json").is_file()
+
 
 QUICK = ("checkpoint=apex-p2d-cpu", "overlay=false", "appearance=false", "accelerator=cpu", "frames=2", "folder=out")
 
@@ -340,6 +396,10 @@ def test_wrong_commands_are_refused_in_one_sentence(command: Callable[..., Ended
             f"video={EXAMPLE}",
         ): "checkpoint = none.ckpt does not exist: give a .ckpt file or a run folder.",
         ("checkpoint=apex-p2d-cpu", f"video={EXAMPLE}", "maks=rle"): "Unknown key maks = 'rle'; did you mean 'masks'?",
+        (
+            "checkpoint=apex-p2d-cpu",
+            "video=",
+        ): "video is empty: give a file, a folder, a pattern with * or a camera (0).",
         (
             "checkpoint=apex-p2d-cpu",
             f"video={EXAMPLE}",

@@ -99,6 +99,23 @@ def test_a_cut_off_video_ends_early_and_its_claim_is_kept(tmp_path: Path) -> Non
     assert video.announced is None or video.announced >= len(found)
 
 
+def test_a_video_is_cut_off_where_its_times_end_before_what_it_announces(tmp_path: Path) -> None:
+    lossless, slower = ("-c:v", "ffv1", "-pix_fmt", "bgr0"), "setpts='(N+gte(N,5)*(N-4)*2)/(10*TB)'"
+    for name in ("variable.mkv", "variable.avi"):
+        video = open_video(encode(tmp_path / name, moving(20), "-vf", slower, "-fps_mode", "vfr", *lossless))
+        frames = list(video.frames())
+        assert (len(frames), video.announced) == (20, 50)  # 5 seconds at the first frames' rate
+        assert video.cut_off(20, frames[-1].time) is None
+        assert video.cut_off(15, frames[14].time) == (
+            "it announces 50 frames, and 15 could be read: it may be cut off or damaged "
+            "(a trimmed video and longer sound announce too many, too)"
+        )
+    even = open_video(encode(tmp_path / "even.mkv", moving(20)))
+    assert even.cut_off(20, 1.9) is None
+    assert even.cut_off(19, 1.8) is None  # sound that is a little longer
+    assert even.cut_off(15, 1.4) is not None
+
+
 def test_what_is_no_video_is_named(tmp_path: Path) -> None:
     (tmp_path / "empty.mp4").touch()
     (tmp_path / "text.mp4").write_text("hello\n")
@@ -123,6 +140,8 @@ def test_nothing_is_printed_about_a_damaged_file(tmp_path: Path, capfd: pytest.C
     (tmp_path / "text.mp4").write_text("hello\n")
     with pytest.raises(UserError):
         open_video(tmp_path / "text.mp4")
+    with pytest.raises(UserError, match="Camera 97 gives no picture"):
+        open_video(97)
     assert capfd.readouterr() == ("", "")
 
 
@@ -203,6 +222,9 @@ def test_what_is_meant_by_folders_and_patterns(tmp_path: Path) -> None:
     assert find_videos(str(folder / "frames")) == [folder / "frames"]
     assert find_videos(f"{folder}/clip_*.mp4") == clips
     assert find_videos([str(clips[1]), f"{folder}/*.mp4", "0"]) == [clips[1], clips[0], 0]
+    for nothing in ("", " ", [str(clips[0]), ""]):
+        with pytest.raises(UserError, match=r"^video is empty: give a file, a folder, a pattern with \* or a camera"):
+            find_videos(nothing)
     with pytest.raises(UserError, match=r"other is a folder without videos or pictures"):
         find_videos(str(folder / "other"))
     with pytest.raises(UserError, match=r"missing\.mp4 does not exist: give a file"):

@@ -222,16 +222,19 @@ def reseeded(job: Job, made: Composed) -> Job:
     return Job(config, made.raw, job.choices, made.words)
 
 
-def device(accelerator: str) -> torch.device:
-    """The device that `trainer.accelerator` asks for.
+def device(accelerator: str, key: str = "accelerator") -> torch.device:
+    """The device that a key of the configuration asks for.
+
+    Args:
+        accelerator: "auto", "cpu" or "gpu".
+        key: its name, for the sentence.
 
     Raises:
         UserError: a GPU is asked for and there is none.
     """
     if accelerator == "gpu" and not torch.cuda.is_available():
-        raise UserError(
-            "trainer.accelerator = 'gpu', but PyTorch finds no CUDA device: use trainer=cpu or trainer=auto."
-        )
+        word = key.partition(".")[0]  # trainer=cpu, accelerator=cpu
+        raise UserError(f"{key} = 'gpu', but PyTorch finds no CUDA device: use {word}=cpu or {word}=auto.")
     return torch.device("cuda" if accelerator != "cpu" and torch.cuda.is_available() else "cpu")
 
 
@@ -304,7 +307,7 @@ def _check_recipe(config: Config, choices: Mapping[str, str]) -> None:
 
 def _check_cuda_graph(trainer: TrainerPart) -> None:
     """A step can be captured on one GPU alone."""
-    kind = device(trainer.accelerator).type
+    kind = device(trainer.accelerator, "trainer.accelerator").type
     if trainer.cuda_graph and (kind != "cuda" or trainer.devices * trainer.num_nodes > 1):
         raise UserError(
             f"trainer.cuda_graph = true needs one CUDA device, and this is {trainer.devices} x {kind}: "

@@ -27,6 +27,7 @@ EXCLUDED = (
     "logger",
     "callbacks.progress",
     "data.root",
+    "data.stored",
     "data.workers",
     "data.generate",
     "data.sim_workers",

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from apex_lab.data.sketchy.source import SketchySource
     from apex_lab.data.sketchy.video_set import Sketchy
     from apex_lab.data.source import VideoSource
-    from apex_lab.data.sprites import Sprites, SpritesSource
+    from apex_lab.data.sprites.source import Sprites, SpritesSource
     from apex_lab.data.video_set import Clip, Item, VideoSet
 
 _MODULES = {
@@ -33,7 +33,7 @@ _MODULES = {
     "sketchy.source": ["SketchySource"],
     "sketchy.video_set": ["Sketchy"],
     "source": ["VideoSource"],
-    "sprites": ["Sprites", "SpritesSource"],
+    "sprites.source": ["Sprites", "SpritesSource"],
     "video_set": ["Clip", "Item", "VideoSet"],
 }
 

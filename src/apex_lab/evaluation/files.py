@@ -62,7 +62,7 @@ def here(file: Path, stored: Mapping[str, Any], paths: config.PathsPart, trusted
     if not isinstance(data, Mapping) or not isinstance(then, Mapping) or "_target_" not in data:
         raise UserError(f"{file} holds no whole configuration: use another checkpoint.")
     own = {key: paths.data if value == then.get("data") else value for key, value in data.items()}
-    if not trusted and own.get("root", paths.data) != paths.data:
+    if not trusted and own.get("root", paths.data) != paths.data and components.takes(own, "data", "generate"):
         own["generate"] = False
     return {**stored, "data": own, "paths": paths.model_dump()}
 

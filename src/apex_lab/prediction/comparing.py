@@ -45,43 +45,57 @@ def clips_of_set(videos: VideoSet, clips: int | Sequence[int]) -> Iterator[Batch
         clips: their indices, or how many, evenly spaced.
 
     Raises:
-        UserError: an index that the set does not have.
+        UserError: an index that the set does not have; said before the first video is read.
     """
     count = len(videos)
-    chosen = (
-        np.unique(np.linspace(0, count - 1, min(clips, count)).round().astype(int)) if isinstance(clips, int) else clips
-    )
+    if isinstance(clips, int):
+        chosen = np.unique(np.linspace(0, count - 1, min(clips, count)).round().astype(int)).tolist()
+    else:
+        chosen = list(clips)
     for index in chosen:
         if not 0 <= index < count:
             raise UserError(f"clips holds {index}, but there are {count} videos: give 0 to {count - 1}.")
-        yield default_collate([videos[int(index)]])
+    return (default_collate([videos[index]]) for index in chosen)
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Which frames of own videos are shown; fields as the keys of conf/compare.yaml."""
+
+    fit: Fit
+    start: int
+    every: int
+    frames: int
 
 
 def clips_of_videos(
-    sources: Sequence[Source], models: Sequence[Model], fit: Fit, start: int, every: int, frames: int
+    sources: Sequence[Source], models: Sequence[Model], cut: Cut, failed: dict[Source, str]
 ) -> Iterator[Batch]:
     """The first frames of own videos, one video at a time, cropped or letterboxed to a square.
 
     Args:
         sources: the videos.
         models: whose inputs say how large the square is.
-        fit: as in predict.
-        start: the first frame.
-        every: every n-th frame.
-        frames: at most so many.
-
-    Raises:
-        UserError: a video that cannot be read, or is too short.
+        cut: which frames.
+        failed: gets the reason for each video that cannot be read, or is too short.
     """
     side = max(SIDE, *(max(model.input_size) for model in models))
     for source in sources:
-        video = open_video(source)
-        view = framing(video.size, (side, side), fit)
-        taken = [view.fitted(frame.image) for frame in islice(video.frames(start), 0, every * (frames - 1) + 1, every)]
-        if not taken:
-            raise UserError(f"{source} has no frame {start}: give a smaller start.")
-        images = torch.from_numpy(np.stack(taken)).permute(0, 3, 1, 2).contiguous()
-        yield {"video": images[None], "name": [video.name]}
+        try:
+            yield _clip(source, side, cut)
+        except UserError as error:
+            failed[source] = str(error)
+
+
+def _clip(source: Source, side: int, cut: Cut) -> Batch:
+    video = open_video(source)
+    view = framing(video.size, (side, side), cut.fit)
+    wanted = islice(video.frames(cut.start), 0, cut.every * (cut.frames - 1) + 1, cut.every)
+    taken = [view.fitted(frame.image) for frame in wanted]
+    if not taken:
+        raise UserError(f"{source} has no frame {cut.start}: give a smaller start.")
+    images = torch.from_numpy(np.stack(taken)).permute(0, 3, 1, 2).contiguous()
+    return {"video": images[None], "name": [video.name]}
 
 
 def compare_clips(models: Sequence[Model], clips: Iterator[Batch], folder: Path, columns: int) -> list[Path]:

@@ -27,12 +27,14 @@ class Entry:
     Attributes:
         done: frames that were predicted.
         ended: the video has no more.
+        time: of the last of them, in seconds.
         reader: plain values of the reader of objects.
         tensors: of the model's state and of the reader.
     """
 
     done: int
     ended: bool
+    time: float
     reader: Mapping[str, Any]
     tensors: Sequence[Leaf] = field(default=(), repr=False)
 
@@ -69,11 +71,12 @@ class Journal:
             content = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
         except ValueError:
             content = None
-        if content is not None and content.get("key") == self.key:
+        if isinstance(content, dict) and content.get("key") == self.key:
             entry = self._entry(content)
             if entry is not None and whole(entry.done):
                 for part in self.parts[len(content["parts"]) :]:
                     shutil.rmtree(part)  # was not closed
+                make_folder(self.results)
                 return entry
             console.warn(f"{self.folder} is damaged; the video starts again.")
         self.clear()
@@ -93,8 +96,9 @@ class Journal:
         state = self._state(len(self.parts))
         with replacing(state) as file:
             torch.save(list(entry.tensors), file)
-        content = {"key": self.key, "done": entry.done, "ended": entry.ended, "reader": dict(entry.reader)}
-        write_json(self.folder / "journal.json", {**content, "parts": [_sizes(part) for part in self.parts]})
+        content = {"key": self.key, "done": entry.done, "ended": entry.ended, "time": entry.time}
+        parts = [_sizes(part) for part in self.parts]
+        write_json(self.folder / "journal.json", {**content, "reader": dict(entry.reader), "parts": parts})
         for old in self.folder.glob("state_*.pt"):
             if old != state:
                 old.unlink()
@@ -105,16 +109,16 @@ class Journal:
             shutil.rmtree(self.folder)
 
     def _entry(self, content: Mapping[str, Any]) -> Entry | None:
-        parts = self.parts
-        if len(parts) < len(content["parts"]) or not content["parts"]:
-            return None
-        if any(_sizes(part) != sizes for part, sizes in zip(parts, content["parts"], strict=False)):
-            return None
         try:
-            tensors = torch.load(self._state(len(content["parts"])), weights_only=True)
+            parts, closed = self.parts, content["parts"]
+            if not 0 < len(closed) <= len(parts):
+                return None
+            if any(_sizes(part) != sizes for part, sizes in zip(parts, closed, strict=False)):
+                return None
+            tensors = torch.load(self._state(len(closed)), weights_only=True)
+            return Entry(content["done"], content["ended"], content["time"], content["reader"], tensors)
         except Exception:  # noqa: BLE001 - what is raised for damaged bytes has no common class
             return None
-        return Entry(content["done"], content["ended"], content["reader"], tensors)
 
     def _state(self, parts: int) -> Path:
         return self.folder / f"state_{parts:05d}.pt"

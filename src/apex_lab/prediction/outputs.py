@@ -26,6 +26,9 @@ from apex_lab.view.encoder import FAST, Mp4, join
 
 Add = Callable[[Predicted], None]
 
+FASTEST = 240.0
+"""Frames per second of an overlay, at most."""
+
 COLUMNS = ("frame", "time", "id", "left", "top", "width", "height", "x", "y", "area", "presence", "mask_index")
 """Of the table, before the appearance vector."""
 
@@ -44,12 +47,23 @@ class Output(ABC):
         """Opens a part in a folder; it is whole when the block is left."""
 
     @abstractmethod
-    def join(self, results: Path, parts: Sequence[Path]) -> None:
-        """Joins the parts, one folder each, to the file among the results."""
+    def join(self, results: Path, parts: Sequence[Path], rate: float | None) -> None:
+        """Joins the parts, one folder each, to the file among the results.
+
+        Args:
+            results: their folder.
+            parts: in order.
+            rate: frames per second, on average; None where a single frame tells none.
+        """
 
 
 class Overlay(Output):
-    """overlay.mp4: the video with its objects painted on it, at a constant frame rate."""
+    """overlay.mp4: the video with its objects painted on it, at a constant frame rate, which is the mean one.
+
+    Args:
+        size: (H, W) of its frames.
+        fps: rate that is expected. That of a video of a variable rate, or of a camera, is known at the end.
+    """
 
     name = "overlay.mp4"
 
@@ -66,8 +80,10 @@ class Overlay(Output):
 
             yield add
 
-    def join(self, results: Path, parts: Sequence[Path]) -> None:
-        join(results / self.name, [part / self.name for part in parts])
+    def join(self, results: Path, parts: Sequence[Path], rate: float | None) -> None:
+        slower = 1.0 if rate is None else self.fps / min(rate, FASTEST)
+        near = abs(slower - 1) < 0.02  # stored times are rounded
+        join(results / self.name, [part / self.name for part in parts], 1.0 if near else slower)
 
 
 class IndexedPngs(Output):
@@ -94,7 +110,7 @@ class IndexedPngs(Output):
         """The file of a frame."""
         return self.folder / f"{number:06d}.png"
 
-    def join(self, results: Path, parts: Sequence[Path]) -> None:
+    def join(self, results: Path, parts: Sequence[Path], rate: float | None) -> None:
         """They are in their place."""
 
 
@@ -116,7 +132,7 @@ class Rle(Output):
 
             yield add
 
-    def join(self, results: Path, parts: Sequence[Path]) -> None:
+    def join(self, results: Path, parts: Sequence[Path], rate: float | None) -> None:
         with open(results / self.name, "w", encoding="utf-8") as whole:
             whole.write("[")
             separator = "\n"
@@ -146,7 +162,7 @@ class Tracks(Output):
 
             yield add
 
-    def join(self, results: Path, parts: Sequence[Path]) -> None:
+    def join(self, results: Path, parts: Sequence[Path], rate: float | None) -> None:
         with open(results / self.name, "w", encoding="utf-8") as whole:
             for part in parts:
                 with open(part / self.name, encoding="utf-8") as lines:
@@ -179,7 +195,7 @@ class CsvTable(Output):
 
             yield add
 
-    def join(self, results: Path, parts: Sequence[Path]) -> None:
+    def join(self, results: Path, parts: Sequence[Path], rate: float | None) -> None:
         with open(results / self.name, "w", encoding="utf-8", newline="") as whole:
             for number, part in enumerate(parts):
                 with open(part / self.name, encoding="utf-8", newline="") as lines:
@@ -212,7 +228,7 @@ class ParquetTable(Output):
         yield add
         pq.write_table(pa.Table.from_pylist(rows, self.schema), folder / self.name)
 
-    def join(self, results: Path, parts: Sequence[Path]) -> None:
+    def join(self, results: Path, parts: Sequence[Path], rate: float | None) -> None:
         with pq.ParquetWriter(results / self.name, self.schema) as whole:
             for part in parts:
                 whole.write_table(pq.read_table(part / self.name, schema=self.schema))

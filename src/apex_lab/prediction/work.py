@@ -91,6 +91,7 @@ class VideoPrediction:
         self.journal = Journal(folder / f".{name}.part", self.key)
         self.reader = Reader(self.view, segmenter.tracks, wanted.min_presence)
         self.outputs = self._outputs()
+        self.time = 0.0  # of the last frame that was predicted
 
     @property
     def key(self) -> str:
@@ -169,6 +170,7 @@ class VideoPrediction:
         """Frames done, and the model's state after them; the reader takes its own."""
         if entry is None:
             return 0, None
+        self.time = entry.time
         values = self.reader.restore(entry.reader, entry.tensors)
         state = None
         if self.segmenter.streams:
@@ -194,6 +196,7 @@ class VideoPrediction:
                     adders = [parts.enter_context(output.part(folder)) for output in self.outputs]
                     while upcoming is not None and done - first < self.wanted.save_interval:
                         frames, scene, start = upcoming
+                        self.time = frames[-1].frame.time
                         for t, each in enumerate(frames):
                             predicted = self.reader(scene, start + t, each.number, each.frame)
                             for add in adders:
@@ -205,7 +208,7 @@ class VideoPrediction:
                         upcoming = next(scenes, None)
                 ended = upcoming is None or (self.video.live and interrupts.asked() is not None)
                 tensors = [*self.reader.tensors(), *leaves(state if self.segmenter.streams else None)]
-                self.journal.close_part(Entry(done, ended, self.reader.stored(), tensors))
+                self.journal.close_part(Entry(done, ended, self.time, self.reader.stored(), tensors))
                 if ended:
                     return done, True
         return done, upcoming is None
@@ -247,8 +250,9 @@ class VideoPrediction:
     def _finish(self, done: int, seconds: float) -> None:
         """Joins the parts and puts the results in place."""
         results = self.journal.results
+        rate = (done - 1) / self.time if self.time > 0 else None
         for output in self.outputs:
-            output.join(results, self.journal.parts)
+            output.join(results, self.journal.parts, rate)
         write_json(results / "info.json", self._info(done))
         make_folder(self.place.parent)
         old = self.journal.folder / "replaced"
@@ -265,8 +269,11 @@ class VideoPrediction:
         segmenter, wanted, video = self.segmenter, self.wanted, self.video
         model = segmenter.predictor.model
         notes = []
-        if video.announced is not None and wanted.frames is None and done < (video.announced - 1) // wanted.every + 1:
-            notes.append(f"the file says that it has {video.announced} frames, and only {done} could be read")
+        if wanted.frames is None:
+            step = self.time / max((done - 1) * wanted.every, 1)
+            # up to every - 1 frames after the last one that was wanted are there too
+            cut_off = video.cut_off(done * wanted.every, self.time + (wanted.every - 1) * step)
+            notes += [] if cut_off is None else [cut_off]
         if not segmenter.tracks:
             notes.append(f"{type(model).__name__} does not track: objects are linked by the overlap of their masks")
         if self.reader.names.reused and wanted.masks == "png":

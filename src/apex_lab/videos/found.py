@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from apex_lab.base.errors import UserError
@@ -31,6 +31,8 @@ def find_videos(patterns: str | Sequence[str]) -> list[Source]:
     """
     found: dict[object, Source] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
+        if not pattern.strip():
+            raise UserError("video is empty: give a file, a folder, a pattern with * or a camera (0).")
         if pattern.isdecimal() and not Path(pattern).exists():
             found.setdefault(int(pattern), int(pattern))
             continue
@@ -56,6 +58,20 @@ def videos_at(path: Path) -> list[Path]:
     if not videos:
         raise UserError(f"{path} is a folder without videos or pictures: give a folder that holds some.")
     return sorted(videos, key=natural_path_key)
+
+
+def listed(failed: Mapping[Source, str], count: int, done: str) -> str:
+    """Why some of the videos failed, a line each.
+
+    Args:
+        failed: video -> sentence.
+        count: how many videos there are.
+        done: what was to be done with them, such as "predicted".
+    """
+    if count == 1:
+        return next(iter(failed.values()))
+    reasons = [why if str(source) in why else f"{source}: {why}" for source, why in failed.items()]
+    return "\n".join([f"{len(failed)} of {count} videos were not {done}:", *(f"  {why}" for why in reasons)])
 
 
 def _matches(pattern: str) -> list[Path]:

@@ -74,6 +74,27 @@ class Video(ABC):
     def stamp(self) -> str:
         """32 hex digits that change when the file changes (its path, size and time of writing)."""
 
+    def cut_off(self, frames: int, last: float) -> str | None:
+        """What to say where clearly less could be read than the file announces; None where it is whole.
+
+        Many files announce a duration alone. Its frames are then counted at one rate, which is wrong for videos of a
+        variable rate; so what counts is how far the times reach.
+
+        Args:
+            frames: how many were read, up to the end.
+            last: time of the last of them, in seconds.
+        """
+        if self.announced is None or frames >= self.announced:
+            return None
+        if self.fps is not None:
+            wanted = self.announced / self.fps
+            if last + 1 / self.fps >= wanted - max(2 / self.fps, 0.1, 0.01 * wanted):
+                return None
+        return (
+            f"it announces {self.announced} frames, and {frames} could be read: it may be cut off or damaged "
+            "(a trimmed video and longer sound announce too many, too)"
+        )
+
 
 def open_video(source: Source | str) -> Video:
     """A video of any kind; its first frame is read, to see that it can be.
@@ -134,12 +155,7 @@ class VideoFile(Video):
         return _stamp([Path(str(self.source))])
 
     def _capture(self) -> cv2.VideoCapture:
-        level = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-        try:
-            return cv2.VideoCapture(str(self.source), cv2.CAP_FFMPEG)
-        finally:
-            cv2.utils.logging.setLogLevel(level)
+        return _opened(str(self.source), cv2.CAP_FFMPEG)
 
 
 class _Clock:
@@ -211,7 +227,7 @@ class Camera(Video):
 
     def __init__(self, number: int) -> None:
         self.source, self.name = number, f"camera_{number}"
-        self._capture = cv2.VideoCapture(number)
+        self._capture = _opened(number)
         self._first = _next(self._capture)
         if self._first is None:
             self._capture.release()
@@ -236,6 +252,16 @@ class Camera(Video):
 
     def stamp(self) -> str:
         return hashlib.sha256(self.name.encode()).hexdigest()[:32]
+
+
+def _opened(*what: Any) -> Any:
+    """A `cv2.VideoCapture`, opened without OpenCV's own messages: what is wrong is said here in one sentence."""
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    try:
+        return cv2.VideoCapture(*what)
+    finally:
+        cv2.utils.logging.setLogLevel(level)
 
 
 def _next(capture: Any) -> UInt8[np.ndarray, "H W 3"] | None:

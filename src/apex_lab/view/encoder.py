@@ -108,19 +108,22 @@ class Mp4:
             raise unwritable(self.path, OSError(f"ffmpeg wrote {count} of {self.written} frames"))
 
 
-def join(path: Path, parts: Sequence[Path]) -> None:
+def join(path: Path, parts: Sequence[Path], slower: float = 1.0) -> None:
     """Joins movies of one size, rate and codec, without encoding them again.
 
     Args:
         path: what to write; a temporary one.
         parts: made by `Mp4`; their paths are those of files beside or below the folder of `path`.
+        slower: how many times as long the frames are shown as in the parts.
 
     Raises:
         UserError: ffmpeg cannot.
     """
     names = path.with_name(f"{path.name}.txt")
     names.write_text("".join(f"file '{os.path.relpath(part, path.parent)}'\n" for part in parts), encoding="utf-8")
-    options = ["-f", "concat", "-safe", "0", "-i", str(names), "-c", "copy", "-movflags", "+faststart", "-y", str(path)]
+    stretched = [] if slower == 1 else ["-itsscale", f"{slower:.9g}"]
+    source = [*stretched, "-f", "concat", "-safe", "0", "-i", str(names)]
+    options = [*source, "-c", "copy", "-movflags", "+faststart", "-y", str(path)]
     ended = subprocess.run(
         [ffmpeg(), "-v", "error", *options], capture_output=True, text=True, stdin=subprocess.DEVNULL
     )

@@ -101,19 +101,22 @@ def test_what_is_damaged_is_named_counted_and_keeps_its_place_in_the_split(
     }
     for number, (content, _) in damaged.items():
         (folder / episode_name(number)).write_bytes(content)
+    (folder / episode_name(5)).unlink()
+    (folder / episode_name(5)).symlink_to(tmp_path / "missing")
+    damaged[5] = (b"", "it cannot be read (No such file or directory)")
     main(words(tmp_path, "--windows", "full"))
     output = capsys.readouterr()
     for number, (_, sentence) in damaged.items():
         assert f"{episode_name(number)} is skipped: {sentence}." in output.err
-    assert "7 episodes with 7 timesteps, 3 skipped." in output.out
+    assert "6 episodes with 6 timesteps, 4 skipped." in output.out
     manifest = Reader(recording(tmp_path), KIND, "train").manifest
-    assert [len(part) for part in episodes_of(manifest.settings).values()] == [6, 0, 1]  # val was episode 0
+    assert [len(part) for part in episodes_of(manifest.settings).values()] == [5, 0, 1]  # val was episode 0
     assert manifest.facts["skipped"] == {episode_name(number): sentence for number, (_, sentence) in damaged.items()}
     # repaired by another download, it is checked again
     (folder / episode_name(0)).write_bytes(whole)
     with pytest.raises(SystemExit):
         main(words(tmp_path, "--windows", "full"))
-    assert "8 episodes with 8 timesteps, 2 skipped." in capsys.readouterr().out
+    assert "7 episodes with 7 timesteps, 3 skipped." in capsys.readouterr().out
 
 
 def test_archives_give_the_same_recording_as_their_episodes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -147,6 +147,14 @@ def features_with(name: str, value: Value | None) -> dict[str, Value]:
     return features
 
 
+def claiming(height: int, width: int) -> bytes:
+    """A JPEG whose header claims another size than it has."""
+    image = bytearray(jpeg(plain(9)))
+    size = image.find(b"\xff\xc0") + 5
+    image[size : size + 4] = struct.pack(">HH", height, width)
+    return bytes(image)
+
+
 def grey() -> bytes:
     return jpeg(np.zeros((600, 960), np.uint8))
 
@@ -168,6 +176,8 @@ def grey() -> bytes:
             lambda: record(example(features_with(FRONT[0], [jpeg(plain(9, 480, 640))]))),
             "480 x 640 pixels RGB, not 600 x 960",
         ),
+        (lambda: record(example(features_with(FRONT[0], [claiming(60000, 60000)]))), "an image of far more than 600"),
+        (lambda: record(example(features_with(FRONT[0], [claiming(0, 960)]))), "no JPEG image"),
         (lambda: record(example(features_with(FRONT[0], [grey()]))), "600 x 960 pixels of mode L"),
         (
             lambda: record(example(features_with(FRONT[0], [jpeg(plain(9))[:-900]]))),

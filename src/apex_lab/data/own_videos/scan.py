@@ -23,7 +23,7 @@ from apex_lab.base.progress import Meter
 from apex_lab.videos import find_videos, open_video
 from recordings import cores
 
-VERSION = 1
+VERSION = 2
 """Raised when the same files give other results."""
 
 
@@ -36,7 +36,7 @@ class Scanned:
         name: relative to the folder of all videos.
         digest: 32 hex digits over the content; empty where it could not be read.
         frames: how many can be read.
-        announced: how many the file says it has; None: not known.
+        cut_off: what to say where it ends earlier than the file announces; None where it does not.
         problem: why it cannot be used; None if it can.
     """
 
@@ -44,7 +44,7 @@ class Scanned:
     name: str
     digest: str
     frames: int
-    announced: int | None
+    cut_off: str | None
     problem: str | None
 
 
@@ -67,12 +67,13 @@ def find(path: str) -> list[Path]:
     return [each for each in found if isinstance(each, Path)]
 
 
-def scan(sources: Sequence[Path], cache: Path) -> list[Scanned]:
+def scan(sources: Sequence[Path], cache: Path, *, keep: bool = True) -> list[Scanned]:
     """Looks at every video, several at a time.
 
     Args:
         sources: files and folders of pictures.
-        cache: JSON file with what was found before; it is written again.
+        cache: JSON file with what was found before.
+        keep: write it again.
 
     Raises:
         Interrupted: asked to stop; what was found until then is kept.
@@ -98,32 +99,30 @@ def scan(sources: Sequence[Path], cache: Path) -> list[Scanned]:
             finally:
                 threads.shutdown(cancel_futures=True)
     finally:
-        if left:
+        if left and keep:
             with suppress(UserError):  # where nothing can be written, the videos are looked at again
                 cache.parent.mkdir(parents=True, exist_ok=True)
                 write_json(cache, {"version": VERSION, "videos": found})
     return [
-        Scanned(
-            str(path), names[path], *(found[str(path)][key] for key in ("digest", "frames", "announced", "problem"))
-        )
+        Scanned(str(path), names[path], *(found[str(path)][key] for key in ("digest", "frames", "cut_off", "problem")))
         for path in sources
     ]
 
 
 def _look(path: Path) -> dict[str, Any]:
-    digest, frames, announced = "", 0, None
+    digest, frames, last, cut_off = "", 0, 0.0, None
     try:
         video = open_video(path)
-        announced = video.announced
-        for _ in video.frames():
-            frames += 1
+        for frame in video.frames():
+            frames, last = frames + 1, frame.time
             interrupts.check()
+        cut_off = video.cut_off(frames, last)
         digest, problem = _digest(path), None
     except UserError as error:
         problem = str(error)
     except OSError as error:
         problem = f"{path} cannot be read ({error.strerror})."
-    return {"digest": digest, "frames": frames, "announced": announced, "problem": problem}
+    return {"digest": digest, "frames": frames, "cut_off": cut_off, "problem": problem}
 
 
 def _names(sources: Sequence[Path]) -> dict[Path, str]:
@@ -168,7 +167,7 @@ def _read(cache: Path) -> dict[str, dict[str, Any]]:
 
 
 def _whole(entry: Any) -> bool:
-    kinds = {"stamp": str, "digest": str, "frames": int, "announced": int | None, "problem": str | None}
+    kinds = {"stamp": str, "digest": str, "frames": int, "cut_off": str | None, "problem": str | None}
     return isinstance(entry, dict) and all(
         name in entry and isinstance(entry[name], kind) for name, kind in kinds.items()
     )

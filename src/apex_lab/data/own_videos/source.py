@@ -22,7 +22,7 @@ from apex_lab.videos import Fit
 from recordings import MANIFEST, Manifest, Plan, read_manifest
 
 SHOWN = 20
-"""Skipped videos that are named on the terminal; the manifest names all."""
+"""Skipped videos that are named on the terminal; the manifest names all. Likewise those that end early."""
 
 
 class OwnVideosSource(RecordedSource):
@@ -47,6 +47,7 @@ class OwnVideosSource(RecordedSource):
         workers: processes that load training clips; 0 loads in the training process.
         prepare_workers: processes that cut clips; None: one per core; 0: the training process.
         verify: when to compare all bytes with their checksums, as for P2D.
+        generate: cut clips that are missing; False: refuse, and write nothing.
 
     Raises:
         UserError: no path, or shares that leave nothing for training.
@@ -73,6 +74,7 @@ class OwnVideosSource(RecordedSource):
         workers: Annotated[int, Field(ge=0)] = 2,
         prepare_workers: Annotated[int, Field(ge=0)] | None = None,
         verify: Verify = "changed",
+        generate: bool = True,
     ) -> None:
         if not path:
             raise UserError("data=video needs videos: set data.path=FOLDER, a folder of video files or of pictures.")
@@ -81,7 +83,7 @@ class OwnVideosSource(RecordedSource):
                 f"data.val_share = {val_share:g} and data.test_share = {test_share:g} leave nothing for training: "
                 "their sum must be below 1."
             )
-        super().__init__(workers, True, prepare_workers, verify)
+        super().__init__(workers, generate, prepare_workers, verify)
         self.root, self.path = Path(root).expanduser().absolute(), path
         span = (frames - 1) * stride + 1
         self._wished: Settings = {
@@ -97,7 +99,7 @@ class OwnVideosSource(RecordedSource):
             UserError: there is no usable video, or the disk is full.
         """
         if self._ready is None:
-            _tell(self._found, sorted_out(self._found, self._wished)[1])
+            _tell(self._found, *sorted_out(self._found, self._wished))
         super().prepare()
         manifest = self.manifest()
         counts = ", ".join(f"{count} {split}" for split, count in manifest.layout.counts.items())
@@ -122,7 +124,7 @@ class OwnVideosSource(RecordedSource):
     def _found(self) -> list[Scanned]:
         """All videos."""
         place = hashlib.sha256(str(Path(self.path).expanduser().absolute()).encode()).hexdigest()[:16]
-        return scan(find(self.path), self.root / f".own_videos_{place}.json")
+        return scan(find(self.path), self.root / f".own_videos_{place}.json", keep=self.generate)
 
     @cached_property
     def _settings(self) -> Settings:
@@ -193,11 +195,17 @@ def sorted_out(found: Sequence[Scanned], settings: Settings) -> tuple[list[Scann
     return usable, skipped
 
 
-def _tell(found: Sequence[Scanned], skipped: Sequence[tuple[Scanned, str]]) -> None:
+def _tell(found: Sequence[Scanned], usable: Sequence[Scanned], skipped: Sequence[tuple[Scanned, str]]) -> None:
     """Names what is skipped, and videos that end before they should."""
-    if skipped:
-        console.warn(f"{len(skipped)} of {len(found)} videos are skipped:")
-        for _, why in skipped[:SHOWN]:
-            console.warn(f"  {why}")
-        if len(skipped) > SHOWN:
-            console.warn(f"  and {len(skipped) - SHOWN} more")
+    short = [f"{video.path}: {video.cut_off}." for video in usable if video.cut_off is not None]
+    _list(f"{len(skipped)} of {len(found)} videos are skipped:", [why for _, why in skipped])
+    _list(f"{len(short)} of {len(found)} videos end early and are used as far as they go:", short)
+
+
+def _list(heading: str, lines: Sequence[str]) -> None:
+    if lines:
+        console.warn(heading)
+        for line in lines[:SHOWN]:
+            console.warn(f"  {line}")
+        if len(lines) > SHOWN:
+            console.warn(f"  and {len(lines) - SHOWN} more")

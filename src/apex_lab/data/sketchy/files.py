@@ -75,7 +75,10 @@ def find(folder: Path) -> Found:
 
 
 def _files(folder: Path) -> list[Path]:
-    """All files below a folder but hidden ones, in the order of names; links to folders are not followed."""
+    """All files below a folder but hidden ones, in the order of names; links to folders are not followed.
+
+    Links that lead nowhere are among them: an episode that is missing is named as one that cannot be read.
+    """
 
     def refuse(error: OSError) -> None:
         raise UserError(f"{error.filename} cannot be read ({error.strerror}): change its permissions.") from error
@@ -84,7 +87,7 @@ def _files(folder: Path) -> list[Path]:
     for parent, folders, names in os.walk(folder, onerror=refuse):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         found += [Path(parent, name) for name in sorted(names) if not name.startswith(".")]
-    return [path for path in found if path.is_file()]
+    return [path for path in found if path.is_file() or not path.exists()]
 
 
 def _missing_parts(archives: Sequence[Path]) -> list[str]:

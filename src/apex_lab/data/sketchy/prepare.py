@@ -102,7 +102,8 @@ def _planned(request: Request) -> tuple[dict[str, Path], Checks, Plan[dict[str, 
     root = make_folder(request.root.absolute())
     with _locked(root / ".sketchy.lock"):
         extracted, problems = extract_all(found.archives, root / EXTRACTED, request.workers or cores())
-        episodes = dict(sorted({**extracted, **found.episodes}.items()))
+        there = {name: file for name, file in found.episodes.items() if name not in extracted or file.exists()}
+        episodes = dict(sorted({**extracted, **there}.items()))
         for remark in [*found.remarks, *problems]:
             console.warn(remark)
         checks = check_all(episodes, root, request.workers or cores())

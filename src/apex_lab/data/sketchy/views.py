@@ -73,6 +73,8 @@ def open_image(jpeg: bytes) -> Image.Image:
     """
     try:
         image = Image.open(io.BytesIO(jpeg), formats=["JPEG"])
+    except Image.DecompressionBombError:  # it claims more pixels than any memory should hold
+        raise DamagedFileError(f"an image of far more than {HEIGHT} x {WIDTH} pixels") from None
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
         raise DamagedFileError("no JPEG image") from None
     if (image.height, image.width, image.mode) != (HEIGHT, WIDTH, "RGB"):
