@@ -42,7 +42,9 @@ from apex_lab.training.callbacks import Pruned
 from apex_lab.training.estimate import try_out
 from apex_lab.training.fit import fit
 from apex_lab.training.learner import Diverged
-from apex_lab.training.loggers import Curves, Wandb, closing
+from apex_lab.training.loggers import Curves
+from apex_lab.training.pictures import Pictures
+from apex_lab.training.showing import Showing, closing
 
 
 def main() -> None:
@@ -159,14 +161,16 @@ def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Cal
     else:
         _load_weights(run, model, checkpoint["inference"]["weights"])
         console.say(f"resuming from step {checkpoint['step']}")
-    with closing(_loggers(run, model, checkpoint["step"] if checkpoint else 0)) as loggers:
+    start = checkpoint["step"] if checkpoint else 0
+    with closing(_loggers(run, model, start)) as loggers:
+        _go_on(loggers, start)
         if not model.needs_training:
             checkpoints.save(run.last, _untrained(run, model))
         elif not _fit(run, model, source, checkpoint, loggers, device, began, further):
             return "paused"
         scored, pictures = _evaluate(run, model, source, device)
         for logger in loggers:
-            if isinstance(logger, Wandb):
+            if isinstance(logger, Showing):
                 logger.results(config.evaluation.split, scored, pictures, run.record["steps"])
     return "finished"
 
@@ -201,7 +205,8 @@ def _fit(
         "training": training,
     }
     with deferring(), ranks.started(job, settings.devices, settings.num_nodes, run.folder) as mine:
-        callbacks, keep = [*_callbacks(run), *further], _checkpoints(run, training, source.labelled)
+        callbacks = [*_callbacks(run), *further, *_pictures(run, loggers)]
+        keep = _checkpoints(run, training, source.labelled)
         return fit(config, model, source, device, start, training, mine, callbacks, keep, loggers, run.folder, deadline)
 
 
@@ -302,18 +307,27 @@ def _loggers(run: Run, model: SceneModel, step: int) -> list[Logger]:
         )
         for name, node in config.logger.items()
     ]
-    if not model.needs_training:
-        return built
-    curves = Curves(run.curves_file, step)
-    for logger in built:
-        if isinstance(logger, Wandb) and curves.open_row is not None:
-            logger.log_metrics(curves.open_row[1], curves.open_row[0])
-    return [curves, *built]
+    return [Curves(run.curves_file, step), *built] if model.needs_training else built
+
+
+def _go_on(loggers: Sequence[Logger], step: int) -> None:
+    """Brings what shows the run to where it goes on."""
+    curves = next((logger for logger in loggers if isinstance(logger, Curves)), None)
+    for logger in loggers:
+        if isinstance(logger, Showing):
+            logger.go_on(step, curves)
 
 
 def _callbacks(run: Run) -> list[L.Callback]:
     """Those of the configuration."""
     return [components.build(node, f"callbacks.{name}") for name, node in run.job.config.callbacks.items()]
+
+
+def _pictures(run: Run, loggers: list[Logger]) -> list[L.Callback]:
+    """What draws for loggers that show pictures."""
+    interval, last = run.job.config.trainer.validation_interval, run.job.config.trainer.max_steps
+    showing = [logger for logger in loggers if isinstance(logger, Showing) and logger.pictures > 0]
+    return [Pictures(logger, interval, last) for logger in showing] if interval is not None else []
 
 
 def _checkpoints(run: Run, training: dict[str, Any] | None, labelled: bool) -> own_callbacks.Checkpoints:

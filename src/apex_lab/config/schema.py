@@ -15,7 +15,15 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import PathText, did_you_mean, sentence, shown, validate
 from apex_lab.config import ablations, components, limits
-from apex_lab.config.checks import RATE, check_range, check_update, looked_at, refuse_checkpoints, refuse_others
+from apex_lab.config.checks import (
+    RATE,
+    check_range,
+    check_update,
+    looked_at,
+    refuse_checkpoints,
+    refuse_missing_package,
+    refuse_others,
+)
 from apex_lab.config.components import is_node
 from apex_lab.config.composition import Composed, conf_dir
 from apex_lab.data.source import VideoSource
@@ -332,6 +340,7 @@ def _check_components(config: Config) -> None:
     for name, node in config.logger.items():
         components.check(node, f"logger.{name}", supplied=["run"])
         refuse_others(node, f"logger.{name}", "Logger")
+        refuse_missing_package(node, f"logger.{name}")
     for name, node in config.callbacks.items():
         components.check(node, f"callbacks.{name}")
         refuse_others(node, f"callbacks.{name}", "Callback")
