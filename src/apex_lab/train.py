@@ -24,9 +24,10 @@ from apex_lab.base.files import read_json
 from apex_lab.base.interrupts import Interrupted, deferring, interruptible
 from apex_lab.base.validation import one_line
 from apex_lab.config import command_line as cli
-from apex_lab.config import components, trust
+from apex_lab.config import components, initial, trust
+from apex_lab.config.checkpoint_files import one_file
 from apex_lab.config.composition import CHOICES
-from apex_lab.config.schema import Job, build_model, build_schedules, check_job, needs_labels, reseeded
+from apex_lab.config.schema import InitialPart, Job, build_model, build_schedules, check_job, needs_labels, reseeded
 from apex_lab.config.schema import device as device_of
 from apex_lab.config.upgrades import fingerprint
 from apex_lab.data import VideoSource, whole_loader
@@ -145,6 +146,8 @@ def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Cal
         run.restore(checkpoint["step"], checkpoint["training"])
     console.say(f"{title(run.job)} on {device.type}: {run.folder}")
     model = build_model(config)
+    if checkpoint is None and config.init_from is not None:
+        _take_initial(config.init_from, model)
     if model.needs_training and checkpoint is None:
         try_out(config, model)
     if model.needs_training and checkpoint is None and device.type == "cpu":
@@ -156,9 +159,9 @@ def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Cal
     source.open()
     interrupts.check()
     _compare_data(run, source.fingerprint, checkpoint)
-    if checkpoint is None:
+    if checkpoint is None and config.init_from is None:
         model.initialise(Statistics(lambda: _median(source, model)))
-    else:
+    elif checkpoint is not None:
         _load_weights(run, model, checkpoint["inference"]["weights"])
         console.say(f"resuming from step {checkpoint['step']}")
     start = checkpoint["step"] if checkpoint else 0
@@ -173,6 +176,21 @@ def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Cal
             if isinstance(logger, Showing):
                 logger.results(config.evaluation.split, scored, pictures, run.record["steps"])
     return "finished"
+
+
+def _take_initial(about: InitialPart, model: SceneModel) -> None:
+    """Gives a model the weights that its training starts from.
+
+    Raises:
+        UserError: their file is gone, damaged, or not what it was when the command was read.
+    """
+    file = one_file(about.checkpoint, initial.KEY)
+    weights = checkpoints.weights(file)
+    if initial.stored(file).digest != about.weights:
+        raise UserError(f"{initial.KEY} = {about.checkpoint} has changed: start the command again with what it is now.")
+    initial.refuse_misfit(about, {name: tuple(value.shape) for name, value in model.state_dict().items()})
+    model.load_state_dict(weights)
+    console.say(f"starting from the weights of {about.checkpoint} ({about.weights[:8]})")
 
 
 def _median(source: VideoSource, model: SceneModel) -> torch.Tensor:

@@ -169,6 +169,7 @@ class Run:
             "overrides": list(self.job.overrides),
             **{group: choices.get(group) for group in ("model", "ablation", "data", "scale", "experiment", "tuned")},
             "seed": config.seed,
+            "init_from": self.job.raw.get("init_from"),
             "fingerprint": fingerprint(self.job.raw),
             "data_fingerprint": self.record.get("data_fingerprint"),
             "commit": commit,

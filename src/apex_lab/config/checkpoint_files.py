@@ -8,20 +8,21 @@ from pathlib import Path
 from apex_lab.base.errors import UserError
 from apex_lab.base.order import natural_path_key
 from apex_lab.base.validation import did_you_mean, sentence
-from apex_lab.runs import shipped
+from apex_lab.config import shipped
 
 Bad = dict[Path, str]
 """What cannot be used -> why, in one sentence."""
 
 
-def find(patterns: Sequence[str]) -> tuple[list[Path], Bad]:
+def find(patterns: Sequence[str], key: str = "checkpoint") -> tuple[list[Path], Bad]:
     """The checkpoint files that are meant, each once, in the order of the patterns; and what holds none.
 
     Files that a folder or a pattern names are in natural order: seed_2 before seed_10.
 
     Args:
         patterns: checkpoint files, run folders (their last checkpoint), folders that hold run folders, patterns with
-            `*` for any of these, or names of shipped weights (`runs.shipped.NAMES`).
+            `*` for any of these, or names of shipped weights (`config.shipped.NAMES`).
+        key: that they were given as, for messages.
 
     Raises:
         UserError: one of them means no checkpoint; of several things that fit a pattern, some may be without.
@@ -29,11 +30,11 @@ def find(patterns: Sequence[str]) -> tuple[list[Path], Bad]:
     found: dict[Path, Path] = {}
     bad: Bad = {}
     for pattern in patterns:
-        matches = _matches(pattern)
+        matches = _matches(pattern, key)
         without: Bad = {}
         for path in matches:
             try:
-                for file in _files(path):
+                for file in _files(path, key):
                     found.setdefault(file.resolve(), file)
             except UserError as error:
                 without[path] = str(error)
@@ -43,7 +44,21 @@ def find(patterns: Sequence[str]) -> tuple[list[Path], Bad]:
     return list(found.values()), bad
 
 
-def _matches(pattern: str) -> list[Path]:
+def one_file(pattern: str, key: str = "checkpoint") -> Path:
+    """The one checkpoint file that is meant.
+
+    Raises:
+        UserError: none, or several.
+    """
+    files, bad = find([pattern], key)
+    if bad:
+        raise UserError(next(iter(bad.values())))
+    if len(files) > 1:
+        raise UserError(f"{key} = {pattern} means {len(files)} checkpoints: give one, such as {files[0]}.")
+    return files[0]
+
+
+def _matches(pattern: str, key: str) -> list[Path]:
     path = Path(pattern)
     if path.exists():
         return [path]
@@ -51,15 +66,15 @@ def _matches(pattern: str) -> list[Path]:
         return [shipped.weights(pattern)]
     if not any(mark in pattern for mark in "*?"):
         hint = did_you_mean(pattern, shipped.NAMES) or ": give a .ckpt file or a run folder"
-        raise UserError(sentence(f"checkpoint = {pattern} does not exist{hint}"))
+        raise UserError(sentence(f"{key} = {pattern} does not exist{hint}"))
     start = Path(path.anchor) if path.is_absolute() else Path()
     found = sorted(start.glob(str(path.relative_to(path.anchor))), key=natural_path_key)
     if not found:
-        raise UserError(f"checkpoint = {pattern} fits nothing: give .ckpt files or run folders.")
+        raise UserError(f"{key} = {pattern} fits nothing: give .ckpt files or run folders.")
     return found
 
 
-def _files(path: Path) -> list[Path]:
+def _files(path: Path, key: str) -> list[Path]:
     """The file itself; the last checkpoint of a run; those of all runs in a folder."""
     if not path.is_dir():
         return [path]
@@ -72,7 +87,7 @@ def _files(path: Path) -> list[Path]:
     ]
     if not inside:
         raise UserError(
-            f"checkpoint = {path} is a folder without checkpoints/last.ckpt, and no run folder is in it: "
+            f"{key} = {path} is a folder without checkpoints/last.ckpt, and no run folder is in it: "
             "give a .ckpt file or a run folder."
         )
     return sorted(inside, key=natural_path_key)
