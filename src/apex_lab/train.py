@@ -38,12 +38,13 @@ from apex_lab.runs.folder import Outcome, Run, group_name, run_folder
 from apex_lab.runs.state import RunState, beating, is_whole, read_state
 from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
-from apex_lab.training import estimate, ranks, worker
+from apex_lab.training import estimate, longer, ranks, worker
 from apex_lab.training.callbacks import Pruned
 from apex_lab.training.estimate import try_out
 from apex_lab.training.fit import fit
 from apex_lab.training.learner import Diverged
 from apex_lab.training.loggers import Curves
+from apex_lab.training.longer import Shorter
 from apex_lab.training.pictures import Pictures
 from apex_lab.training.showing import Showing, closing
 
@@ -146,19 +147,16 @@ def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Cal
         run.restore(checkpoint["step"], checkpoint["training"])
     console.say(f"{title(run.job)} on {device.type}: {run.folder}")
     model = build_model(config)
-    if checkpoint is None and config.init_from is not None:
-        _take_initial(config.init_from, model)
-    if model.needs_training and checkpoint is None:
-        try_out(config, model)
-    if model.needs_training and checkpoint is None and device.type == "cpu":
-        warning = estimate.warning(config, model)
-        if warning is not None:
-            console.warn(warning)
+    shorter = _look_ahead(run, model, device, further) if model.needs_training and checkpoint is None else []
     source: VideoSource = components.build(config.data, "data")
     source.prepare()
     source.open()
     interrupts.check()
     _compare_data(run, source.fingerprint, checkpoint)
+    if shorter:
+        checkpoint = longer.take_over(run, shorter, model)
+        if checkpoint is not None:
+            run.restore(checkpoint["step"], checkpoint["training"])
     if checkpoint is None and config.init_from is None:
         model.initialise(Statistics(lambda: _median(source, model)))
     elif checkpoint is not None:
@@ -176,6 +174,21 @@ def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Cal
             if isinstance(logger, Showing):
                 logger.results(config.evaluation.split, scored, pictures, run.record["steps"])
     return "finished"
+
+
+def _look_ahead(run: Run, model: SceneModel, device: torch.device, further: Sequence[L.Callback]) -> list[Shorter]:
+    """What precedes the data of a run that begins: its weights, a try, and shorter runs that it can go on with."""
+    config = run.job.config
+    if config.init_from is not None:
+        _take_initial(config.init_from, model)
+    try_out(config, model)
+    # further callbacks would miss what the shorter run did
+    shorter = [] if further else longer.find(run.job, _named(run.job))
+    if not shorter and device.type == "cpu":
+        warning = estimate.warning(config, model)
+        if warning is not None:
+            console.warn(warning)
+    return shorter
 
 
 def _take_initial(about: InitialPart, model: SceneModel) -> None:

@@ -97,6 +97,15 @@ class Curves(Logger):
                 {name: float(value) for name, value in row.items() if value != "" and name != "step"},
             )
 
+    def forget(self, step: int, beginning: str) -> None:
+        """Takes out the values of a step whose names begin so."""
+        kept = [
+            {n: v for n, v in row.items() if int(row["step"]) != step or not n.startswith(beginning)}
+            for row in self.rows
+        ]
+        self.rows = [row for row in kept if any(value != "" for name, value in row.items() if name != "step")]
+        self._rewrite()
+
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
         """Nothing: the configuration lies beside the curves."""
 
