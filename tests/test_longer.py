@@ -106,7 +106,7 @@ def test_schedules_that_depend_on_the_length_are_told(train: Callable[..., Ended
     shorter = runs(tmp_path / "outputs")[6].relative_to(tmp_path)
     assert line == (
         f"{shorter}, the same run with 6 steps, is not gone on with: lr_scale was 0.8333333333333334 at step 1 and is "
-        "0.9166666666666666 with trainer.max_steps = 12; training starts from the beginning."
+        "0.9166666666666666 with trainer.max_steps = 12. Training starts from the beginning."
     )
     assert train(FALLING, "trainer.max_steps=12", "paths.outputs=unbroken").code == 0
     check_as_unbroken(runs(tmp_path / "outputs")[12], runs(tmp_path / "unbroken")[12])
@@ -142,7 +142,7 @@ def test_a_shorter_run_that_cannot_be_used_is_told(train: Callable[..., Ended], 
     torch.save(changed, last)
     ended = train("trainer.max_steps=7")
     assert ended.code == 0, ended.err
-    assert "is not gone on with: it was trained on other data; training starts from the beginning." in ended.out
+    assert "is not gone on with: it was trained on other data.\nTraining starts from the beginning.\n" in ended.out
     # of several the longest that is whole
     last.write_bytes(whole)
     (seven,) = (run for steps, run in runs(tmp_path / "outputs").items() if steps == 7)
@@ -153,6 +153,7 @@ def test_a_shorter_run_that_cannot_be_used_is_told(train: Callable[..., Ended], 
     assert f"{seven.relative_to(tmp_path)}, the same run with 7 steps, is not gone on with: " in ended.out
     assert "its end is missing" in ended.out
     assert f"going on from step 6 of {trained.relative_to(tmp_path)}" in ended.out
+    assert "from the beginning" not in ended.out
 
 
 def test_runs_that_are_not_finished_or_differ_otherwise_are_passed_over(
@@ -167,3 +168,15 @@ def test_runs_that_are_not_finished_or_differ_otherwise_are_passed_over(
     assert "going on" not in ended.out
     assert [row["step"] for row in curves(trained)] == ["1", "2", "3", "4", "5", "6"]
     assert weights(trained)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["apex", "gswm", "op3", "scalor", "slot_attention", "space"])
+def test_every_learned_model(model: str, command: Callable[..., Ended], tmp_path: Path) -> None:
+    words = (f"model={model}", "data=sprites", "scale=smoke", "evaluation.pictures=0", "trainer=cpu")
+    assert command("train", *words).code == 0
+    ended = command("train", *words, "trainer.max_steps=9")
+    assert ended.code == 0, ended.err
+    assert "going on from step 6" in ended.out
+    assert command("train", *words, "trainer.max_steps=9", "paths.outputs=unbroken").code == 0
+    check_as_unbroken(runs(tmp_path / "outputs")[9], runs(tmp_path / "unbroken")[9])

@@ -32,6 +32,8 @@ from apex_lab.training.loggers import Curves
 
 Number = Callable[[int], float | None]
 
+ANEW = "Training starts from the beginning."
+
 
 @dataclass(frozen=True)
 class Shorter:
@@ -70,13 +72,12 @@ def find(job: Job, known: Collection[str]) -> list[Shorter]:
         except _NotSo as why:
             reasons.append(_told(shorter, why))
     if reasons and not found:
-        console.say(reasons[0])
+        console.say(f"{reasons[0]} {ANEW}")
     return found
 
 
 def _told(shorter: Shorter, why: _NotSo | UserError) -> str:
-    told = f"{shorter.folder}, the same run with {shorter.steps} steps, is not gone on with: {one_line(why)}"
-    return sentence(f"{told}; training starts from the beginning")
+    return sentence(f"{shorter.folder}, the same run with {shorter.steps} steps, is not gone on with: {one_line(why)}")
 
 
 def _candidates(job: Job, known: Collection[str]) -> Iterator[Shorter]:
@@ -164,6 +165,7 @@ def take_over(run: Run, found: Sequence[Shorter], model: SceneModel) -> dict[str
             continue
         _put(run, shorter, last, best)
         return checkpoints.load(run.last, known=known)
+    console.say(ANEW)
     return None
 
 
