@@ -112,6 +112,7 @@ def test_the_numbers_and_the_name_of_a_run_do_not_depend_on_it(train: Callable[.
     assert not list(plain.glob("tensorboard"))
 
 
+@pytest.mark.slow
 def test_it_takes_up_a_run_that_began_without_it(
     train: Callable[..., Ended], the_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -131,6 +132,7 @@ def test_it_takes_up_a_run_that_began_without_it(
     check_complete(run)
 
 
+@pytest.mark.slow
 def test_each_job_of_a_sweep_has_its_own_folder(train: Callable[..., Ended], tmp_path: Path) -> None:
     assert train("logger=tensorboard", "seed=0,1", "-m").code == 0
     runs = sorted(tmp_path.glob("outputs/*/seed_*"))
@@ -139,6 +141,7 @@ def test_each_job_of_a_sweep_has_its_own_folder(train: Callable[..., Ended], tmp
         check_complete(run)
 
 
+@pytest.mark.slow
 def test_a_model_that_does_not_train_shows_its_scores(
     train: Callable[..., Ended], the_run: Callable[..., Path]
 ) -> None:

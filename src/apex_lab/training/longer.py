@@ -26,7 +26,7 @@ from apex_lab.config.upgrades import FORMAT, fingerprint
 from apex_lab.runs import checkpoints
 from apex_lab.runs.folder import Run
 from apex_lab.runs.identity import stored_configuration, with_same_words
-from apex_lab.runs.state import read_state
+from apex_lab.runs.state import has_scores, read_state
 from apex_lab.scene import SceneModel
 from apex_lab.training.loggers import Curves
 
@@ -84,7 +84,7 @@ def _candidates(job: Job, known: Collection[str]) -> Iterator[Shorter]:
     """Finished runs that differ in nothing but a smaller `trainer.max_steps` and scheduled values."""
     own, identity = job.raw, fingerprint(job.raw)
     for folder in with_same_words(Path(job.config.paths.outputs), job.choices, job.config.seed):
-        state = read_state(folder, job.config.evaluation.split)
+        state = read_state(folder)
         steps = state.record.get("max_steps")
         if state.state != "finished" or state.record.get("format") != FORMAT or not isinstance(steps, int):
             continue
@@ -96,6 +96,8 @@ def _candidates(job: Job, known: Collection[str]) -> Iterator[Shorter]:
             clips = {**raw["clips"], "frames": own["clips"]["frames"]}
             trainer = {**raw["trainer"], "max_steps": job.config.trainer.max_steps}
             if fingerprint({**raw, **scheduled, "clips": clips, "trainer": trainer}) == identity:
+                if not has_scores(folder, job.config.evaluation.split):
+                    continue
                 trust.check(raw, str(folder / "config.yaml"), known)
                 yield Shorter(folder, steps, raw)
         except (OSError, yaml.YAMLError, LookupError, TypeError, AttributeError, ValueError, RecursionError, UserError):
@@ -173,7 +175,6 @@ def _put(run: Run, shorter: Shorter, last: Mapping[str, Any], best: Mapping[str,
     step, training = last["step"], last["training"]
     console.say(f"going on from step {step} of {shorter.folder}, which stays as it is")
     about = {"folder": str(shorter.folder), "step": step}
-    run.update(continues=about)
     _copy_curves(shorter.folder / run.curves_file.name, run.curves_file, step, run.job.config)
     if best is not None:
         checkpoints.save(run.best, _as_own(best, run.job))
