@@ -109,7 +109,7 @@ def test_schedules_that_depend_on_the_length_are_told(train: Callable[..., Ended
         f"{shorter}, the same run with 6 steps, is not gone on with: lr_scale was 0.8333333333333334 at step 1 and is "
         "0.9166666666666666 with trainer.max_steps = 12. Training starts from the beginning."
     )
-    assert [row["step"] for row in curves(runs(tmp_path / "outputs")[12])][0] == "1"
+    assert curves(runs(tmp_path / "outputs")[12])[0]["step"] == "1"
     assert "resuming" not in ended.out
     assert "continues" not in record(runs(tmp_path / "outputs")[12])
 
