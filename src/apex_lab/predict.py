@@ -22,8 +22,7 @@ from apex_lab.base.files import make_folder, unwritable
 from apex_lab.base.validation import one_line, sentence, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import schema as config
-from apex_lab.config.checkpoint_files import one_file
-from apex_lab.prediction.load import digest_of, segmenter_of
+from apex_lab.prediction.load import digest_of, one_file, segmenter_of
 from apex_lab.prediction.work import Wanted, Weights, predict_video, unique_names
 from apex_lab.runs import checkpoints
 from apex_lab.videos import Source, find_videos

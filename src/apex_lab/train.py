@@ -25,7 +25,6 @@ from apex_lab.base.interrupts import Interrupted, deferring, interruptible
 from apex_lab.base.validation import one_line
 from apex_lab.config import command_line as cli
 from apex_lab.config import components, initial, trust
-from apex_lab.config.checkpoint_files import one_file
 from apex_lab.config.composition import CHOICES
 from apex_lab.config.schema import InitialPart, Job, build_model, build_schedules, check_job, needs_labels, reseeded
 from apex_lab.config.schema import device as device_of
@@ -197,7 +196,7 @@ def _take_initial(about: InitialPart, model: SceneModel) -> None:
     Raises:
         UserError: their file is gone, damaged, or not what it was when the command was read.
     """
-    file = one_file(about.checkpoint, initial.KEY)
+    file = initial.file_of(about.checkpoint)
     weights = checkpoints.weights(file)
     if initial.stored(file).digest != about.weights:
         raise UserError(f"{initial.KEY} = {about.checkpoint} has changed: start the command again with what it is now.")

@@ -19,9 +19,8 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.machine import bounded_memory
 from apex_lab.base.outlines import Placed, digest, outline
-from apex_lab.base.validation import openable, shown
+from apex_lab.base.validation import did_you_mean, openable, sentence, shown
 from apex_lab.config import shipped
-from apex_lab.config.checkpoint_files import one_file
 
 KEY = "init_from"
 
@@ -62,12 +61,12 @@ def identified(value: object, outputs: object) -> dict[str, str]:
         known = " or ".join(shipped.NAMES)
         raise UserError(f"{KEY} = {shown(value)} is wrong: give a checkpoint file, a run folder, or {known}.")
     try:
-        named = not Path(openable(value)).exists() and value in shipped.NAMES
+        named = not os.path.exists(openable(value)) and value in shipped.NAMES
     except ValueError as error:
         raise UserError(f"{KEY} = {shown(value)} is wrong: {error}.") from error
     where = value if named else os.path.abspath(value)
     try:
-        file = one_file(value, KEY)
+        file = file_of(value)
     except UserError:
         remembered = _remembered(where, outputs)
         if len(remembered) > 1:
@@ -79,6 +78,28 @@ def identified(value: object, outputs: object) -> dict[str, str]:
             raise
         return {"checkpoint": where, "weights": remembered.pop()}
     return {"checkpoint": where, "weights": stored(file).digest}
+
+
+def file_of(where: str) -> Path:
+    """The checkpoint file that is meant.
+
+    Args:
+        where: a file, a run folder, or the name of shipped weights.
+
+    Raises:
+        UserError: it is not there.
+    """
+    path, last = Path(where), Path(where, "checkpoints", "last.ckpt")
+    if os.path.isfile(path):
+        return path
+    if os.path.isfile(last):
+        return last
+    if os.path.exists(path):
+        raise UserError(f"{KEY} = {where} holds no checkpoints/last.ckpt: give a .ckpt file or a run folder.")
+    if where in shipped.NAMES:
+        return shipped.weights(where)
+    hint = did_you_mean(where, shipped.NAMES) or ": give a .ckpt file or a run folder"
+    raise UserError(sentence(f"{KEY} = {where} does not exist{hint}"))
 
 
 def stored(file: Path) -> Stored:
@@ -172,7 +193,7 @@ def refuse_misfit(about: Any, here: Sizes) -> None:
         UserError: they do not fit.
     """
     try:
-        file = one_file(about.checkpoint, KEY)
+        file = file_of(about.checkpoint)
     except UserError:
         return  # a run that has begun needs it no more
     told = misfit(stored(file).sizes, here)

@@ -11,9 +11,9 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence, validate
 from apex_lab.config import components
 from apex_lab.config import schema as config
-from apex_lab.config.checkpoint_files import Bad, find
 from apex_lab.evaluation.other_data import OtherData
 from apex_lab.runs import checkpoints
+from apex_lab.runs.checkpoint_files import Bad, find
 
 __all__ = ["Bad", "find", "here", "listed", "look", "of_another_version"]
 

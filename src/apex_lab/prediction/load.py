@@ -12,11 +12,11 @@ import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence
-from apex_lab.config.checkpoint_files import one_file
 from apex_lab.inference.loading import trained_model
 from apex_lab.inference.predictor import Predictor
 from apex_lab.inference.segmenter import Segmenter
 from apex_lab.runs import checkpoints
+from apex_lab.runs.checkpoint_files import find
 from apex_lab.scene import schedule_at
 from apex_lab.videos import Fit
 
@@ -46,6 +46,20 @@ def load(
     """
     file = one_file(os.fspath(checkpoint))
     return segmenter_of(file, checkpoints.load(file, trust), _device(device), fit, full_size, detail)
+
+
+def one_file(checkpoint: str) -> Path:
+    """The one checkpoint file that is meant.
+
+    Raises:
+        UserError: none, or several.
+    """
+    files, bad = find([checkpoint])
+    if bad:
+        raise UserError(next(iter(bad.values())))
+    if len(files) > 1:
+        raise UserError(f"checkpoint = {checkpoint} means {len(files)} checkpoints: give one, such as {files[0]}.")
+    return files[0]
 
 
 def segmenter_of(

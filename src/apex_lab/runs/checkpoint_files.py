@@ -14,7 +14,7 @@ Bad = dict[Path, str]
 """What cannot be used -> why, in one sentence."""
 
 
-def find(patterns: Sequence[str], key: str = "checkpoint") -> tuple[list[Path], Bad]:
+def find(patterns: Sequence[str]) -> tuple[list[Path], Bad]:
     """The checkpoint files that are meant, each once, in the order of the patterns; and what holds none.
 
     Files that a folder or a pattern names are in natural order: seed_2 before seed_10.
@@ -22,7 +22,6 @@ def find(patterns: Sequence[str], key: str = "checkpoint") -> tuple[list[Path], 
     Args:
         patterns: checkpoint files, run folders (their last checkpoint), folders that hold run folders, patterns with
             `*` for any of these, or names of shipped weights (`config.shipped.NAMES`).
-        key: that they were given as, for messages.
 
     Raises:
         UserError: one of them means no checkpoint; of several things that fit a pattern, some may be without.
@@ -30,11 +29,11 @@ def find(patterns: Sequence[str], key: str = "checkpoint") -> tuple[list[Path], 
     found: dict[Path, Path] = {}
     bad: Bad = {}
     for pattern in patterns:
-        matches = _matches(pattern, key)
+        matches = _matches(pattern)
         without: Bad = {}
         for path in matches:
             try:
-                for file in _files(path, key):
+                for file in _files(path):
                     found.setdefault(file.resolve(), file)
             except UserError as error:
                 without[path] = str(error)
@@ -44,21 +43,7 @@ def find(patterns: Sequence[str], key: str = "checkpoint") -> tuple[list[Path], 
     return list(found.values()), bad
 
 
-def one_file(pattern: str, key: str = "checkpoint") -> Path:
-    """The one checkpoint file that is meant.
-
-    Raises:
-        UserError: none, or several.
-    """
-    files, bad = find([pattern], key)
-    if bad:
-        raise UserError(next(iter(bad.values())))
-    if len(files) > 1:
-        raise UserError(f"{key} = {pattern} means {len(files)} checkpoints: give one, such as {files[0]}.")
-    return files[0]
-
-
-def _matches(pattern: str, key: str) -> list[Path]:
+def _matches(pattern: str) -> list[Path]:
     path = Path(pattern)
     if path.exists():
         return [path]
@@ -66,15 +51,15 @@ def _matches(pattern: str, key: str) -> list[Path]:
         return [shipped.weights(pattern)]
     if not any(mark in pattern for mark in "*?"):
         hint = did_you_mean(pattern, shipped.NAMES) or ": give a .ckpt file or a run folder"
-        raise UserError(sentence(f"{key} = {pattern} does not exist{hint}"))
+        raise UserError(sentence(f"checkpoint = {pattern} does not exist{hint}"))
     start = Path(path.anchor) if path.is_absolute() else Path()
     found = sorted(start.glob(str(path.relative_to(path.anchor))), key=natural_path_key)
     if not found:
-        raise UserError(f"{key} = {pattern} fits nothing: give .ckpt files or run folders.")
+        raise UserError(f"checkpoint = {pattern} fits nothing: give .ckpt files or run folders.")
     return found
 
 
-def _files(path: Path, key: str) -> list[Path]:
+def _files(path: Path) -> list[Path]:
     """The file itself; the last checkpoint of a run; those of all runs in a folder."""
     if not path.is_dir():
         return [path]
@@ -87,7 +72,7 @@ def _files(path: Path, key: str) -> list[Path]:
     ]
     if not inside:
         raise UserError(
-            f"{key} = {path} is a folder without checkpoints/last.ckpt, and no run folder is in it: "
+            f"checkpoint = {path} is a folder without checkpoints/last.ckpt, and no run folder is in it: "
             "give a .ckpt file or a run folder."
         )
     return sorted(inside, key=natural_path_key)
