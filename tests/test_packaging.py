@@ -58,6 +58,6 @@ def test_the_wheel_s_own_configuration_is_used_from_any_folder(wheel: Path, tmp_
     told = ask("-c", f"{where}; from apex_lab.train import main; main()", "scale=smoke", "--cfg", "job")
     assert told.splitlines()[0] == str(site / "apex_lab/conf")
     assert "max_steps: 6\n" in told
-    shipped = ask("-c", "from apex_lab.runs.shipped import weights; print(weights('apex-p2d-cpu'))")
+    shipped = ask("-c", "from apex_lab.config.shipped import weights; print(weights('apex-p2d-cpu'))")
     assert shipped.strip() == str(site / "apex_lab/weights/apex_p2d_cpu.ckpt")
     assert list(elsewhere.iterdir()) == []

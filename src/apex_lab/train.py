@@ -24,9 +24,9 @@ from apex_lab.base.files import read_json
 from apex_lab.base.interrupts import Interrupted, deferring, interruptible
 from apex_lab.base.validation import one_line
 from apex_lab.config import command_line as cli
-from apex_lab.config import components, trust
+from apex_lab.config import components, initial, trust
 from apex_lab.config.composition import CHOICES
-from apex_lab.config.schema import Job, build_model, build_schedules, check_job, needs_labels, reseeded
+from apex_lab.config.schema import InitialPart, Job, build_model, build_schedules, check_job, needs_labels, reseeded
 from apex_lab.config.schema import device as device_of
 from apex_lab.config.upgrades import fingerprint
 from apex_lab.data import VideoSource, whole_loader
@@ -37,12 +37,15 @@ from apex_lab.runs.folder import Outcome, Run, group_name, run_folder
 from apex_lab.runs.state import RunState, beating, is_whole, read_state
 from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
-from apex_lab.training import estimate, ranks, worker
+from apex_lab.training import estimate, longer, ranks, worker
 from apex_lab.training.callbacks import Pruned
 from apex_lab.training.estimate import try_out
 from apex_lab.training.fit import fit
 from apex_lab.training.learner import Diverged
-from apex_lab.training.loggers import Curves, Wandb, closing
+from apex_lab.training.loggers import Curves
+from apex_lab.training.longer import Shorter
+from apex_lab.training.pictures import Pictures
+from apex_lab.training.showing import Showing, closing
 
 
 def main() -> None:
@@ -143,32 +146,63 @@ def _train(run: Run, device: torch.device, began: float, further: Sequence[L.Cal
         run.restore(checkpoint["step"], checkpoint["training"])
     console.say(f"{title(run.job)} on {device.type}: {run.folder}")
     model = build_model(config)
-    if model.needs_training and checkpoint is None:
-        try_out(config, model)
-    if model.needs_training and checkpoint is None and device.type == "cpu":
-        warning = estimate.warning(config, model)
-        if warning is not None:
-            console.warn(warning)
+    shorter = _look_ahead(run, model, device, further) if model.needs_training and checkpoint is None else []
     source: VideoSource = components.build(config.data, "data")
     source.prepare()
     source.open()
     interrupts.check()
     _compare_data(run, source.fingerprint, checkpoint)
-    if checkpoint is None:
+    if shorter:
+        checkpoint = longer.take_over(run, shorter, model)
+        if checkpoint is not None:
+            run.restore(checkpoint["step"], checkpoint["training"])
+    if checkpoint is None and config.init_from is None:
         model.initialise(Statistics(lambda: _median(source, model)))
-    else:
+    elif checkpoint is not None:
         _load_weights(run, model, checkpoint["inference"]["weights"])
         console.say(f"resuming from step {checkpoint['step']}")
-    with closing(_loggers(run, model, checkpoint["step"] if checkpoint else 0)) as loggers:
+    start = checkpoint["step"] if checkpoint else 0
+    with closing(_loggers(run, model, start)) as loggers:
+        _go_on(loggers, start)
         if not model.needs_training:
             checkpoints.save(run.last, _untrained(run, model))
         elif not _fit(run, model, source, checkpoint, loggers, device, began, further):
             return "paused"
         scored, pictures = _evaluate(run, model, source, device)
         for logger in loggers:
-            if isinstance(logger, Wandb):
+            if isinstance(logger, Showing):
                 logger.results(config.evaluation.split, scored, pictures, run.record["steps"])
     return "finished"
+
+
+def _look_ahead(run: Run, model: SceneModel, device: torch.device, further: Sequence[L.Callback]) -> list[Shorter]:
+    """What precedes the data of a run that begins: its weights, a try, and shorter runs that it can go on with."""
+    config = run.job.config
+    if config.init_from is not None:
+        _take_initial(config.init_from, model)
+    try_out(config, model)
+    # further callbacks would miss what the shorter run did
+    shorter = [] if further else longer.find(run.job, _named(run.job))
+    if not shorter and device.type == "cpu":
+        warning = estimate.warning(config, model)
+        if warning is not None:
+            console.warn(warning)
+    return shorter
+
+
+def _take_initial(about: InitialPart, model: SceneModel) -> None:
+    """Gives a model the weights that its training starts from.
+
+    Raises:
+        UserError: their file is gone, damaged, or not what it was when the command was read.
+    """
+    file = initial.file_of(about.checkpoint)
+    weights = checkpoints.weights(file)
+    if initial.stored(file).digest != about.weights:
+        raise UserError(f"{initial.KEY} = {about.checkpoint} has changed: start the command again with what it is now.")
+    initial.refuse_misfit(about, {name: tuple(value.shape) for name, value in model.state_dict().items()})
+    model.load_state_dict(weights)
+    console.say(f"starting from the weights of {about.checkpoint} ({about.weights[:8]})")
 
 
 def _median(source: VideoSource, model: SceneModel) -> torch.Tensor:
@@ -201,7 +235,8 @@ def _fit(
         "training": training,
     }
     with deferring(), ranks.started(job, settings.devices, settings.num_nodes, run.folder) as mine:
-        callbacks, keep = [*_callbacks(run), *further], _checkpoints(run, training, source.labelled)
+        callbacks = [*_callbacks(run), *further, *_pictures(run, loggers)]
+        keep = _checkpoints(run, training, source.labelled)
         return fit(config, model, source, device, start, training, mine, callbacks, keep, loggers, run.folder, deadline)
 
 
@@ -302,18 +337,27 @@ def _loggers(run: Run, model: SceneModel, step: int) -> list[Logger]:
         )
         for name, node in config.logger.items()
     ]
-    if not model.needs_training:
-        return built
-    curves = Curves(run.curves_file, step)
-    for logger in built:
-        if isinstance(logger, Wandb) and curves.open_row is not None:
-            logger.log_metrics(curves.open_row[1], curves.open_row[0])
-    return [curves, *built]
+    return [Curves(run.curves_file, step), *built] if model.needs_training else built
+
+
+def _go_on(loggers: Sequence[Logger], step: int) -> None:
+    """Brings what shows the run to where it goes on."""
+    curves = next((logger for logger in loggers if isinstance(logger, Curves)), None)
+    for logger in loggers:
+        if isinstance(logger, Showing):
+            logger.go_on(step, curves)
 
 
 def _callbacks(run: Run) -> list[L.Callback]:
     """Those of the configuration."""
     return [components.build(node, f"callbacks.{name}") for name, node in run.job.config.callbacks.items()]
+
+
+def _pictures(run: Run, loggers: list[Logger]) -> list[L.Callback]:
+    """What draws for loggers that show pictures."""
+    interval, last = run.job.config.trainer.validation_interval, run.job.config.trainer.max_steps
+    showing = [logger for logger in loggers if isinstance(logger, Showing) and logger.pictures > 0]
+    return [Pictures(logger, interval, last) for logger in showing] if interval is not None else []
 
 
 def _checkpoints(run: Run, training: dict[str, Any] | None, labelled: bool) -> own_callbacks.Checkpoints:

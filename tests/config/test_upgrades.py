@@ -133,7 +133,7 @@ def test_excluded_keys_change_no_fingerprint(key: str) -> None:
     raw = compose_job().raw
     changed = {**raw}
     group, _, name = key.partition(".")
-    changed[group] = {**raw[group], name: "other"} if name else "other"
+    changed[group] = {**(raw[group] or {}), name: "other"} if name else "other"
     assert fingerprint(changed) == fingerprint(raw)
 
 

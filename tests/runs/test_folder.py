@@ -24,7 +24,8 @@ def changed(raw: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
     *path, last = key.split(".")
     part = raw
     for name in path:
-        part = part.setdefault(name, {})
+        part[name] = dict(part.get(name) or {})
+        part = part[name]
     part[last] = value
     return raw
 

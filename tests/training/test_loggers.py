@@ -7,11 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from PIL import Image
 
 from apex_lab.base.wandb_account import credentials
 from apex_lab.training.loggers import Curves
 from tests.conftest import TINY, Ended
-from tests.test_train import start, wait_for_step
+from tests.test_train import start, wait_for_step, weights, without_speed
 from tests.training import wandb_file
 
 
@@ -169,9 +171,33 @@ def test_wandb_offline_is_complete_also_after_a_kill_and_resumption(
     files = folders[1] / "files"
     assert (shown["test/film_strip"]["_type"], shown["test/movie"]["_type"]) == ("image-file", "video-file")
     assert (files / shown["test/film_strip"]["path"]).read_bytes() == (run / "view" / "film_strip.png").read_bytes()
+    drawn = {
+        row["_step"]: folder
+        for folder, part in ((folders[0], first), (folders[1], second))
+        for row in wandb_file.history(part)
+        if "val/pictures" in row
+    }
+    assert sorted(drawn) == [3, 6, 9, 12]
     table = json.loads((files / shown["test/per_video"]["path"]).read_text())
     place = table["columns"].index("ari_fg")
     assert [row[place] for row in table["data"]] == [row["ari_fg"] for row in scored["per_video"]]
+
+
+def test_wandb_shows_pictures_and_changes_no_number(
+    train: Callable[..., Ended], trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    plain = trained.rename(trained.with_name("plain"))
+    assert train("logger=wandb", "logger.wandb.pictures_every=2").code == 0
+    assert without_speed(trained) == without_speed(plain)
+    ours, theirs = weights(trained), weights(plain)
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    [folder] = offline_folders(trained)
+    rows = wandb_file.history(wandb_file.records(next(folder.glob("*.wandb"))))
+    [(step, shown)] = [(row["_step"], row["val/pictures"]) for row in rows if "val/pictures" in row]
+    assert (step, shown["_type"]) == (6, "image-file")
+    with Image.open(folder / "files" / shown["path"]) as picture:
+        assert picture.height > 2 * 5 * 128  # two videos of five rows
 
 
 def test_wandb_takes_the_scores_of_a_model_that_does_not_train(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
@@ -40,6 +41,13 @@ def refuse_checkpoints(node: Mapping[str, Any], key: str) -> None:
             f"{key}: a run keeps its checkpoints itself (trainer.checkpoint_interval, trainer.monitor): "
             f"leave {node['_target_']} out."
         )
+
+
+def refuse_missing_package(node: Mapping[str, Any], key: str) -> None:
+    """A component that needs a package which does not come with apex_lab names it, and the extra that brings it."""
+    package, extra = getattr(components.target_of(node, key), "NEEDS", (None, None))
+    if package is not None and importlib.util.find_spec(package) is None:
+        raise UserError(f"{key} needs a package that is not installed: pip install 'apex-lab[{extra}]'.")
 
 
 def check_update(build: Builder, weights: Sequence[tuple[str, nn.Parameter]], target: object) -> None:

@@ -22,7 +22,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, openable, sentence, shown
-from apex_lab.config import trust
+from apex_lab.config import initial, trust
 from apex_lab.config.upgrades import fingerprint
 
 CHOICES = ("model", "ablation", "data", "scale", "experiment", "tuned")
@@ -69,8 +69,10 @@ def conf_dir() -> Path:
 def plain(config: DictConfig) -> dict[str, Any]:
     """A composed configuration as plain containers, all interpolations resolved; `???` stays where a value is missing.
 
+    Weights that training starts from stand there with their digest (`apex_lab.config.initial`).
+
     Raises:
-        UserError: an interpolation leads nowhere.
+        UserError: an interpolation leads nowhere, or there are no such weights.
     """
     try:
         container = OmegaConf.to_container(config, resolve=True, throw_on_missing=False)
@@ -78,7 +80,13 @@ def plain(config: DictConfig) -> dict[str, Any]:
         key = f"{error.full_key}: " if error.full_key else ""
         raise UserError(sentence(key + str(error.msg).splitlines()[0])) from error
     assert isinstance(container, dict)
-    return {str(key): value for key, value in container.items()}
+    raw: dict[str, Any] = {str(key): value for key, value in container.items()}
+    if raw.get(initial.KEY) is not None:
+        paths = raw.get("paths")
+        raw[initial.KEY] = initial.identified(
+            raw[initial.KEY], paths.get("outputs") if isinstance(paths, dict) else None
+        )
+    return raw
 
 
 def chosen(runtime: Any) -> dict[str, str]:

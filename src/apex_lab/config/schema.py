@@ -14,8 +14,16 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import PathText, did_you_mean, sentence, shown, validate
-from apex_lab.config import ablations, components, limits
-from apex_lab.config.checks import RATE, check_range, check_update, looked_at, refuse_checkpoints, refuse_others
+from apex_lab.config import ablations, components, initial, limits
+from apex_lab.config.checks import (
+    RATE,
+    check_range,
+    check_update,
+    looked_at,
+    refuse_checkpoints,
+    refuse_missing_package,
+    refuse_others,
+)
 from apex_lab.config.components import is_node
 from apex_lab.config.composition import Composed, conf_dir
 from apex_lab.data.source import VideoSource
@@ -80,10 +88,18 @@ class PathsPart(_Part):
     data: PathText
 
 
+class InitialPart(_Part):
+    """Weights that training starts from; `apex_lab.config.initial` puts them in place of the word that was given."""
+
+    checkpoint: str
+    weights: str = Field(pattern=f"^{initial.DIGEST}$")
+
+
 class Config(_Part):
     """The root of what `python -m apex_lab.train` composes; components are checked by `apex_lab.config.components`."""
 
     seed: int = Field(ge=0, lt=2**32)
+    init_from: InitialPart | None = None
     model: dict[str, Any]
     optimizer: dict[str, Any] | None
     schedule: dict[str, dict[str, Any]]
@@ -335,6 +351,7 @@ def _check_components(config: Config) -> None:
     for name, node in config.logger.items():
         components.check(node, f"logger.{name}", supplied=["run"])
         refuse_others(node, f"logger.{name}", "Logger")
+        refuse_missing_package(node, f"logger.{name}")
     for name, node in config.callbacks.items():
         components.check(node, f"callbacks.{name}")
         refuse_others(node, f"callbacks.{name}", "Callback")
@@ -344,6 +361,10 @@ def _check_components(config: Config) -> None:
 def _check_objective(config: Config) -> None:
     """Builds model, optimiser and schedules, and compares their names."""
     model = build_model(config)
+    if config.init_from is not None:
+        if not model.needs_training:
+            raise UserError("init_from is for training, and this model has nothing to train: leave it out.")
+        initial.refuse_misfit(config.init_from, {n: tuple(v.shape) for n, v in model.state_dict().items()})
     schedules, weights = build_schedules(config), build_weights(config)
     source = components.build(config.data, "data")
     if not isinstance(source, VideoSource):

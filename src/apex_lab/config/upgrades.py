@@ -18,11 +18,13 @@ FORMAT = 2
 
 ADDED: dict[str, Any] = {
     "trainer.cuda_graph": False,
+    "init_from": None,
 }
 """Keys added since `FORMAT` was raised, with the value that they had before they existed."""
 
 EXCLUDED = (
     "seed",
+    "init_from.checkpoint",  # the digest of its weights stays
     "paths",
     "logger",
     "callbacks.progress",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,9 +22,12 @@ from apex_lab.evaluation.partial import Parts, Predicted
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.inference.predictor import Batch, Predictor
 from apex_lab.metrics import Evaluator, EvaluatorSettings, background_identities, scene_identities
-from apex_lab.scene import ABSENT
+from apex_lab.scene import ABSENT, Scene
 
 Batches = DataLoader[Item]
+
+Onlooker = Callable[[Batch, Scene], None]
+"""Sees a batch and the model's scene of it."""
 
 
 @dataclass
@@ -133,22 +136,31 @@ def score(predictor: Predictor, batches: Batches, scoring: ScoringPart, parts: P
 
 
 def add_batch(
-    tally: Tally, predictor: Predictor, batch: Batch, videos: VideoSet, scoring: ScoringPart
+    tally: Tally,
+    predictor: Predictor,
+    batch: Batch,
+    videos: VideoSet,
+    scoring: ScoringPart,
+    onlookers: Sequence[Onlooker] = (),
 ) -> list[Predicted]:
     """Predicts and scores one batch; returns the predictions."""
-    found = list(predict(predictor, batch, scoring))
+    found = list(predict(predictor, batch, scoring, onlookers))
     for b, predicted in enumerate(found):
         tally.add(predicted, videos, batch["segmentation"][b].numpy() if videos.labelled else None)
     return found
 
 
-def predict(predictor: Predictor, batch: Batch, scoring: ScoringPart) -> Iterator[Predicted]:
+def predict(
+    predictor: Predictor, batch: Batch, scoring: ScoringPart, onlookers: Sequence[Onlooker] = ()
+) -> Iterator[Predicted]:
     """The model's output for each video of a batch.
 
     Raises:
         UserError: pixels that belong to no identity.
     """
     scene = predictor(batch)
+    for look in onlookers:
+        look(batch, scene)
     labels = batch.get("segmentation")
     size = batch["video"].shape[-2:] if labels is None else labels.shape[-2:]
     try:

@@ -8,7 +8,7 @@ from pathlib import Path
 from apex_lab.base.errors import UserError
 from apex_lab.base.order import natural_path_key
 from apex_lab.base.validation import did_you_mean, sentence
-from apex_lab.runs import shipped
+from apex_lab.config import shipped
 
 Bad = dict[Path, str]
 """What cannot be used -> why, in one sentence."""
@@ -21,7 +21,7 @@ def find(patterns: Sequence[str]) -> tuple[list[Path], Bad]:
 
     Args:
         patterns: checkpoint files, run folders (their last checkpoint), folders that hold run folders, patterns with
-            `*` for any of these, or names of shipped weights (`runs.shipped.NAMES`).
+            `*` for any of these, or names of shipped weights (`config.shipped.NAMES`).
 
     Raises:
         UserError: one of them means no checkpoint; of several things that fit a pattern, some may be without.

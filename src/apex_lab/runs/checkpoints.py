@@ -18,7 +18,7 @@ from __future__ import annotations
 import io
 import pickle
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -30,11 +30,11 @@ from apex_lab.base import faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import replacing, unwritable
 from apex_lab.base.machine import bounded_memory
+from apex_lab.base.outlines import outline
 from apex_lab.base.validation import shown
 from apex_lab.config import components, trust
 from apex_lab.config.schema import Config, build_schedules
 from apex_lab.config.upgrades import FORMAT, upgraded
-from apex_lab.runs.outlines import outline
 from apex_lab.runs.record import LARGEST, Kept
 from apex_lab.scene import SceneModel
 
@@ -113,18 +113,30 @@ def load(path: Path, trusted: bool = False, known: Iterable[str] = ()) -> dict[s
     """
     with _reading(path):
         content = _upgraded(_read(path, trusted, known, whole=True))
-        weights = content["inference"]["weights"]
-        strange = [name for name, weight in weights.items() if not isinstance(weight, torch.Tensor)]
-        if strange:
-            raise UserError(
-                f"{path} is no apex_lab checkpoint (its weight {strange[0]} is no tensor): use another one."
-            )
-        sick = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
-        if sick:
-            raise UserError(
-                f"{path} holds weights that are not finite ({sick[0]}): its run diverged; use an earlier one."
-            )
+        _check_weights(path, content["inference"]["weights"])
         return content
+
+
+def weights(path: Path) -> dict[str, torch.Tensor]:
+    """The weights of a checkpoint alone. Nothing that the file names is built, so its author need not be trusted.
+
+    Raises:
+        UserError: as `load`, but for classes.
+    """
+    with _reading(path):
+        content = _read(path, trusted=True, known=(), whole=True)
+        found: dict[str, torch.Tensor] = {**content, **_inside(content)}["weights"]
+        _check_weights(path, found)
+        return found
+
+
+def _check_weights(path: Path, weights: Mapping[str, Any]) -> None:
+    strange = [name for name, weight in weights.items() if not isinstance(weight, torch.Tensor)]
+    if strange:
+        raise UserError(f"{path} is no apex_lab checkpoint (its weight {strange[0]} is no tensor): use another one.")
+    sick = [name for name, weight in weights.items() if not torch.isfinite(weight).all()]
+    if sick:
+        raise UserError(f"{path} holds weights that are not finite ({sick[0]}): its run diverged; use an earlier one.")
 
 
 def glance(path: Path, trusted: bool = False) -> dict[str, Any]:

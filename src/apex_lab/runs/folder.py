@@ -49,7 +49,7 @@ def run_folder(job: Job) -> Path:
 Outcome = Literal["finished", "paused", "failed", "interrupted", "diverged", "pruned"]
 """How a run's last attempt ended; null in the record while it is running. Paused: `trainer.max_minutes` were over."""
 
-KEPT = ("foreground_share", "history", "wandb_id")
+KEPT = ("continues", "foreground_share", "history", "wandb_id")
 """Entries of the record that the checkpoint keeps too: what nothing else could bring back if run.json were lost."""
 
 
@@ -169,6 +169,7 @@ class Run:
             "overrides": list(self.job.overrides),
             **{group: choices.get(group) for group in ("model", "ablation", "data", "scale", "experiment", "tuned")},
             "seed": config.seed,
+            "init_from": self.job.raw.get("init_from"),
             "fingerprint": fingerprint(self.job.raw),
             "data_fingerprint": self.record.get("data_fingerprint"),
             "commit": commit,

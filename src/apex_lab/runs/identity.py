@@ -49,6 +49,22 @@ def run_folder(outputs: Outputs, identity: str, choices: Mapping[str, str], seed
     return outputs.older(_words(choices), identity, f"seed_{seed}") or named
 
 
+def with_same_words(outputs: Path, choices: Mapping[str, str], seed: object) -> list[Path]:
+    """Folders of a seed whose names have the words of some choices, whatever their hash.
+
+    Args:
+        outputs: the folder of runs; need not exist.
+        choices: group -> the word chosen for it.
+        seed: of the runs.
+    """
+    named = re.compile(rf"{re.escape(_words(choices))}_[0-9a-f]{{8}}")
+    try:
+        names = sorted(os.listdir(outputs))
+    except OSError:
+        return []
+    return [outputs / name / f"seed_{seed}" for name in names if named.fullmatch(name)]
+
+
 def seed_folders(outputs: Path) -> list[Path]:
     """Every folder of a run, by name in natural order and then by seed; none where `outputs` does not exist.
 

@@ -24,11 +24,21 @@ class Start(BaseModel):
     started: str
 
 
+class Continued(BaseModel):
+    """The shorter run that a run began with, and at which step."""
+
+    model_config = ConfigDict(extra="ignore", strict=True)
+
+    folder: str
+    step: int = Field(ge=0, lt=LARGEST)
+
+
 class Kept(BaseModel):
     """What a checkpoint keeps of a record, in case that the file is lost."""
 
     model_config = ConfigDict(extra="ignore", strict=True)
 
+    continues: Continued | None = None
     history: list[Start] = []
     foreground_share: float | None = None
     wandb_id: str | None = None

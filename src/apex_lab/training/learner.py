@@ -20,7 +20,7 @@ from torch.optim import Optimizer
 
 from apex_lab.base.errors import UserError
 from apex_lab.data.video_set import VideoSet
-from apex_lab.evaluation.score import Tally, add_batch, video_set
+from apex_lab.evaluation.score import Onlooker, Tally, add_batch, video_set
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.inference.predictor import Batch, Predictor
 from apex_lab.metrics.keys import VALIDATION_SCORES
@@ -43,6 +43,7 @@ class Learner(L.LightningModule):
     Attributes:
         stop: why training stops before its next step (`apex_lab.training.callbacks.Lockstep` sets it): the number of a
             signal, 0 when time is up; None to go on.
+        onlookers: called with every batch of validation and the model's scene of it.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class Learner(L.LightningModule):
         self.update = update
         self.logged_loss = math.nan
         self.stop: int | None = None
+        self.onlookers: list[Onlooker] = []
         self._optimizer, self._log_interval = optimizer, log_interval
         self._rank, self._ranks = rank, ranks
         self._scoring = ScoringPart()
@@ -150,7 +152,7 @@ class Learner(L.LightningModule):
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         assert self._tally is not None
-        add_batch(self._tally, self._predictor, batch, self._videos(), self._scoring)
+        add_batch(self._tally, self._predictor, batch, self._videos(), self._scoring, self.onlookers)
 
     def on_validation_epoch_end(self) -> None:
         assert self._tally is not None

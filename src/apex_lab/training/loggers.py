@@ -1,8 +1,10 @@
-"""Where the curves go: curves.csv in every run folder, and Weights & Biases where `logger=wandb` asks for it."""
+"""Where the curves go: curves.csv in every run folder, and Weights & Biases where `logger=wandb` asks for it.
+
+TensorBoard: `apex_lab.training.tensorboard`.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import os
@@ -14,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lightning.pytorch.loggers import Logger
+from PIL import Image
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
@@ -21,6 +24,7 @@ from apex_lab.base.files import set_aside, unwritable, write_text
 from apex_lab.base.validation import one_line
 from apex_lab.base.wandb_account import credentials
 from apex_lab.runs.folder import Run, group_name
+from apex_lab.training.showing import Interval, Showing, Videos
 
 
 class Curves(Logger):
@@ -85,6 +89,23 @@ class Curves(Logger):
         except OSError as error:
             raise unwritable(self.path, error) from error
 
+    def values(self) -> Iterator[tuple[int, dict[str, float]]]:
+        """Step and values of each row."""
+        for row in self.rows:
+            yield (
+                int(row["step"]),
+                {name: float(value) for name, value in row.items() if value != "" and name != "step"},
+            )
+
+    def forget(self, step: int, beginning: str) -> None:
+        """Takes out the values of a step whose names begin so."""
+        kept = [
+            {n: v for n, v in row.items() if int(row["step"]) != step or not n.startswith(beginning)}
+            for row in self.rows
+        ]
+        self.rows = [row for row in kept if any(value != "" for name, value in row.items() if name != "step")]
+        self._rewrite()
+
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
         """Nothing: the configuration lies beside the curves."""
 
@@ -139,7 +160,7 @@ FLUSH = 0.2
 """Seconds that values wait in wandb's process before they are in an offline run's file; a kill can cost that much."""
 
 
-class Wandb(Logger):
+class Wandb(Logger, Showing):
     """Weights & Biases; a network that is away or credentials that are missing never stop a run.
 
     Args:
@@ -147,14 +168,23 @@ class Wandb(Logger):
         project: wandb project.
         entity: wandb user or team; None is the account's default.
         mode: `auto` is online where credentials exist (WANDB_API_KEY, ~/.netrc), else offline.
+        pictures: how many validation videos are drawn during training.
+        pictures_every: validations between two pictures.
     """
 
     def __init__(
-        self, run: Run, project: str, entity: str | None = None, mode: Literal["auto", "online", "offline"] = "auto"
+        self,
+        run: Run,
+        project: str,
+        entity: str | None = None,
+        mode: Literal["auto", "online", "offline"] = "auto",
+        pictures: Videos = 2,
+        pictures_every: Interval = 1,
     ) -> None:
         super().__init__()
-        self._run = run
-        if "wandb_id" not in run.record:
+        self._run, self.pictures, self.pictures_every = run, pictures, pictures_every
+        self._unknown = run.record.get("wandb_id") is None  # to wandb, so that it has none of the curves yet
+        if self._unknown:
             run.update(wandb_id=secrets.token_hex(4))
         self._step = 0
         self._wandb = self._start(project, entity, mode)
@@ -211,6 +241,14 @@ class Wandb(Logger):
         started.define_metric("*", step_metric="step")
         return started
 
+    def go_on(self, step: int, curves: Curves | None) -> None:
+        """Sends what was logged before wandb knew of the run, or the last row, which it may have lost by a kill."""
+        if curves is not None and self._unknown:
+            for at, values in curves.values():
+                self._log(values, at)
+        elif curves is not None and curves.open_row is not None:
+            self._log(curves.open_row[1], curves.open_row[0])
+
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         """Sends values at a step of training, which is wandb's own step too, so that a resumed run goes on there."""
         self._log(metrics, step or 0)
@@ -222,15 +260,14 @@ class Wandb(Logger):
     def log_hyperparams(self, params: dict[str, Any] | Namespace, *args: Any, **kwargs: Any) -> None:
         """Nothing: the configuration is sent at the start."""
 
-    def results(self, split: str, scored: Mapping[str, Any], pictures: Sequence[Path], step: int) -> None:
-        """Sends the final scores as summary, the scores of each video as a table, and the pictures.
+    def picture(self, name: str, page: Image.Image, step: int) -> None:
+        """Sends a picture of a step of training."""
+        import wandb
 
-        Args:
-            split: what was evaluated.
-            scored: what metrics.json holds of it.
-            pictures: their files.
-            step: weight updates made.
-        """
+        self._log({name: wandb.Image(page)}, step)
+
+    def results(self, split: str, scored: Mapping[str, Any], pictures: Sequence[Path], step: int) -> None:
+        """Sends the final scores as summary, the scores of each video as a table, and the pictures."""
         import wandb
 
         total = {key: value for key, value in scored["total"].items() if isinstance(value, int | float)}
@@ -251,16 +288,3 @@ class Wandb(Logger):
             self._wandb.finish(exit_code=int(failed))
         except Exception as error:  # noqa: BLE001 - its process may have got the signal that ends this one
             console.warn(f"wandb: the end could not be sent ({one_line(error)}).")
-
-
-@contextlib.contextmanager
-def closing(loggers: list[Logger]) -> Iterator[list[Logger]]:
-    """Ends wandb's runs with the block, whatever ends it."""
-    failed = True
-    try:
-        yield loggers
-        failed = False
-    finally:
-        for logger in loggers:
-            if isinstance(logger, Wandb):
-                logger.close(failed)

@@ -32,9 +32,18 @@ def film_strip(path: Path, items: Sequence[Item], columns: int = 8) -> None:
         ValueError: no item, or one whose parts do not fit each other.
         UserError: the file cannot be written.
     """
+    save_png(path, film_page(items, columns))
+
+
+def film_page(items: Sequence[Item], columns: int = 8) -> Image.Image:
+    """What `film_strip` draws, as a picture in memory.
+
+    Raises:
+        ValueError: no item, or one whose parts do not fit each other.
+    """
     if not items:
         raise ValueError("items is empty, expected at least one video")
-    save_png(path, _stack([_strip(Clip(item), columns) for item in items]))
+    return _stack([_strip(Clip(item), columns) for item in items])
 
 
 def spread(frames: int, columns: int) -> list[int]:
