@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import did_you_mean, openable, sentence, shown
+from apex_lab.base.validation import did_you_mean, sentence, shown, to_open
 from apex_lab.config import trust
 from apex_lab.config.upgrades import fingerprint
 
@@ -91,14 +91,23 @@ def chosen(runtime: Any) -> dict[str, str]:
     found = {str(k): str(v) for k, v in choices if not str(k).startswith("hydra/") and v is not None}
     for key, word in found.items():
         group, elsewhere, package = key.partition("@")
-        if not _CHOSEN.fullmatch(word):  # such as ../model/apex: it would stand in the name of the run's folder
-            raise UserError(f"{key}={word} is no name of a choice: write {key}={_stem(word)}.")
+        check_choice(key, word)
         if elsewhere:  # no check of a choice would see it
             raise UserError(f"{key}={found[key]}: a choice of {group} has its own place: leave out @{package}.")
     folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
     return {
         group: word for group, word in found.items() if any((at / group / f"{word}.yaml").is_file() for at in folders)
     }
+
+
+def check_choice(group: str, word: str) -> None:
+    """Refuses what is no name of a file in a group, such as ../model/apex: it would name the run's folder too.
+
+    Raises:
+        UserError: the word is none.
+    """
+    if not _CHOSEN.fullmatch(word):
+        raise UserError(f"{group}={word} is no name of a choice: write {group}={_stem(word)}.")
 
 
 _CHOSEN = re.compile(r"\w[\w+-]*(/\w[\w+-]*)*")
@@ -226,10 +235,7 @@ def folder_of_runs(value: object) -> Path:
     """
     if not isinstance(value, str):
         raise UserError(f"paths.outputs = {shown(value)} is wrong: give a folder.")
-    try:
-        return Path(openable(value))
-    except ValueError as error:
-        raise UserError(f"paths.outputs = {shown(value)} is wrong: {error}.") from error
+    return to_open("paths.outputs", value)
 
 
 def _check_tuned(choices: Mapping[str, str], runtime: Any) -> None:
@@ -271,7 +277,7 @@ def _no_choice(overrides: Sequence[str]) -> str:
         values = list(override.sweep_iterator()) if override.is_discrete_sweep() else [override.value()]
         folder = conf_dir() / group
         if folder.is_dir() and not all(isinstance(value, str | list) for value in values):
-            known = sorted(path.stem for path in folder.glob("*.yaml"))
+            known = sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
             return sentence(f"{override.input_line} names no choice of {group}: write one of {', '.join(known)}")
     return "A choice is a word, and one of these is a number or null: " + sentence(" ".join(overrides))
 

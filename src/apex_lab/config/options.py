@@ -16,6 +16,8 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.validation import sentence
 from apex_lab.config.composition import full_names
 
+_COMPLETION = re.compile(r"(install|uninstall|query)=(bash|zsh|fish)")
+
 _ALONE = ("run", "multirun", "cfg", "info", "shell_completion")
 
 
@@ -37,6 +39,8 @@ def options() -> argparse.Namespace:
         raise UserError(f"{' and '.join(given)} do not go together: leave out one of them.")
     if asked.resolve and not asked.cfg:
         raise UserError("--resolve goes with --cfg alone: write --cfg job --resolve.")
+    if asked.shell_completion and not (len(asked.overrides) == 1 and _COMPLETION.fullmatch(asked.overrides[0])):
+        raise UserError("--shell-completion goes with one word alone: install=bash, uninstall=zsh or query=fish.")
     if asked.package is not None and not asked.cfg:
         raise UserError("--package goes with --cfg alone: write --cfg job --package ...")
     return asked

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -44,7 +45,7 @@ class Reader(argparse.ArgumentParser):
 
 @contextmanager
 def ending(code: int = CONFIG_ERROR) -> Iterator[None]:
-    """Inside, an exception ends the process with one sentence on standard error.
+    """Inside, an exception ends the process with one sentence on standard error, and so does Ctrl-C.
 
     Args:
         code: of the process.
@@ -56,3 +57,6 @@ def ending(code: int = CONFIG_ERROR) -> Iterator[None]:
     except UserError as error:
         console.error(str(error))
         sys.exit(code)
+    except KeyboardInterrupt:
+        console.error("Stopped by SIGINT.")
+        sys.exit(128 + signal.SIGINT)

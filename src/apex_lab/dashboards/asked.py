@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json
-from apex_lab.base.validation import did_you_mean, sentence, validate
+from apex_lab.base.validation import PathText, did_you_mean, sentence, validate
 from apex_lab.base.wandb_account import credentials
 from apex_lab.config import command_line as cli
 from apex_lab.config.composition import CHOICES, composing, conf_dir, plain
@@ -47,7 +47,7 @@ class DashboardsConfig(BaseModel):
 
     project: str | None = Field(min_length=1)
     entity: str | None = Field(min_length=1)
-    folder: str | None = Field(min_length=1)
+    folder: PathText | None
     dry_run: bool
 
 

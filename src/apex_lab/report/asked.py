@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_text
-from apex_lab.base.validation import sentence, validate
+from apex_lab.base.validation import PathText, sentence, validate
 from apex_lab.config import preflight
 from apex_lab.config.composition import CHOICES, composing, conf_dir, plain
 from apex_lab.config.reader import Reader, ending
@@ -50,7 +50,7 @@ class ReportConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    folder: str | None = Field(min_length=1)
+    folder: PathText | None
     videos: bool
     megabytes: float = Field(ge=0, allow_inf_nan=False)
 

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import fitting
 from apex_lab.base.order import natural_path_key
+from apex_lab.base.validation import to_open
 from apex_lab.videos.pictures import SUFFIXES, pictures_in
 from apex_lab.videos.reader import Source
 
@@ -59,13 +61,12 @@ def videos_at(path: Path) -> list[Path]:
 
 
 def _matches(pattern: str) -> list[Path]:
-    path = Path(pattern).expanduser()
+    path = to_open("video", pattern).expanduser()
     if path.exists():
         return [path]
     if not any(mark in pattern for mark in "*?["):
         raise UserError(f"video = {pattern} does not exist: give a file, a folder, a pattern with * or a camera (0).")
-    start = Path(path.anchor) if path.is_absolute() else Path()
-    found = [each for each in start.glob(str(path.relative_to(path.anchor))) if _plausible(each)]
+    found = [each for each in fitting("video", path) if _plausible(each)]
     if not found:
         raise UserError(f"video = {pattern} fits nothing: give video files or folders of pictures.")
     return sorted(found, key=natural_path_key)

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from apex_lab.base import console
+from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted, interruptible
 from apex_lab.data.own_videos.maker import KIND, ClipMaker, Settings
@@ -22,18 +22,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command.add_argument("folder", type=Path, help="a folder that `data=video` has made")
     command.add_argument("--repair", action="store_true", help="cut damaged clips again")
     command.add_argument("--path", help="where the videos are now, if they have been moved")
-    command.add_argument("--workers", type=int, help="number of processes (default: one per core)")
+    command.add_argument("--workers", type=_positive, help="number of processes (default: one per core)")
     asked = parser.parse_args(arguments)
     console.setup()
     try:
-        with interruptible():
-            return _verify(asked.folder, asked.repair, asked.path, asked.workers)
-    except (UserError, RecordingError) as error:
+        with faults.net(), interruptible():
+            return _work(asked.folder, asked.repair, asked.path, asked.workers)
+    except UserError as error:
         console.error(str(error))
         return 1
     except Interrupted as stop:
         console.error(f"stopped by {stop}; the same command goes on.")
         return 128 + stop.signum
+
+
+def _work(folder: Path, mend: bool, path: str | None, workers: int | None) -> int:
+    try:
+        return _verify(folder, mend, path, workers)
+    except RecordingError as error:
+        raise UserError(str(error)) from error
 
 
 def _verify(folder: Path, mend: bool, path: str | None, workers: int | None) -> int:
@@ -64,6 +71,13 @@ def _maker(plan: Plan[Settings], facts: Facts, folder: Path, path: str | None) -
     about = {name: value for name, value in facts.items() if name != "versions"}
     sources = [str(Path(found[video["digest"]]).absolute()) for video in plan.settings["videos"]]
     return ClipMaker(plan.settings, sources, about)
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not at least 1")
+    return value
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from apex_lab.base import console
+from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted, interruptible
 from apex_lab.data.sketchy.prepare import EXTRACTED, Request, prepare, repair_recording
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console.setup()
     request = Request(options.folder, options.root, options.name, options.image_size, options.windows, options.workers)
     try:
-        with interruptible():
+        with faults.net(), interruptible():
             (_repair if options.repair else _prepare)(request)
     except UserError as error:
         console.error(str(error))
