@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import shlex
 import signal
@@ -54,6 +55,18 @@ def positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not at least 1")
     return value
+
+
+def path_argument(text: str) -> Path:
+    """A path for an option of `argparse`; an empty one, as an unset variable gives it, would be the current folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("it is empty, as an unset variable is: give a path")
+    try:
+        os.lstat(text)
+    except (OSError, ValueError) as error:
+        if isinstance(error, ValueError) or error.errno in (errno.ENAMETOOLONG, errno.EINVAL):
+            raise argparse.ArgumentTypeError(f"no path can be so ({error})") from error
+    return Path(text)
 
 
 def told(error: BaseException) -> str:

@@ -17,7 +17,7 @@ from recordings.progress import progress
 from recordings.streams import say
 from sims.background import background
 from sims.camera import Camera
-from sims.command import ending
+from sims.command import ending, path_argument
 from sims.errors import SimError
 from sims.p2d.settings import Settings
 from sims.p2d.settings_text import SettingsError, settings_from
@@ -37,7 +37,7 @@ SCENE = Settings(min_objects=2, max_objects=3, objects=OBJECTS, camera=CAMERA, a
 def main(arguments: list[str] | None = None) -> int:
     """Writes the videos that are missing; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sims.example_videos", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for the MP4 files")
+    parser.add_argument("--out", type=path_argument, required=True, help="folder for the MP4 files")
     parser.add_argument("--videos", type=int, default=20, help="how many (default: 20)")
     parser.add_argument("--frames", type=int, default=48, help="frames per video (default: 48)")
     parser.add_argument("--size", type=int, default=192, help="width in pixels (default: 192)")

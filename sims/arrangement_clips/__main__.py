@@ -10,7 +10,7 @@ from pathlib import Path
 from recordings import read_manifest, verify
 from recordings.streams import say
 from sims.arrangement_clips.recording import KIND, make, plan, repair
-from sims.command import ending, positive
+from sims.command import ending, path_argument, positive
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -50,12 +50,12 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="make | verify", required=True)
     command = commands.add_parser("make", help="make a folder of clips, or resume one")
     command.set_defaults(run=_make)
-    command.add_argument("dir", type=Path)
+    command.add_argument("dir", type=path_argument)
     command.add_argument("--settings", default="{}", help="fields of sims.arrangement_clips.settings.Settings, as JSON")
     command.add_argument("--workers", type=positive, help="number of processes (default: one per core)")
     command = commands.add_parser("verify", help="compare all bytes with their checksums")
     command.set_defaults(run=_verify)
-    command.add_argument("dir", type=Path)
+    command.add_argument("dir", type=path_argument)
     command.add_argument("--repair", action="store_true", help="make damaged clips again")
     command.add_argument("--workers", type=positive, help="number of processes (default: one per core)")
     return parser

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from recordings import MANIFEST, read_journal, verify
 from recordings.streams import say
-from sims.command import ending, positive
+from sims.command import ending, path_argument, positive
 from sims.p2d.generate import generate, repair
 from sims.p2d.settings import Settings
 from sims.p2d.settings_text import SettingsError, settings_from
@@ -90,7 +90,7 @@ def _parser() -> argparse.ArgumentParser:
         epilog="settings (--set): " + ", ".join(f"{k}={v.default!r}" for k, v in Settings.model_fields.items()),
     )
     parser.set_defaults(run=_make)
-    parser.add_argument("--out", type=Path, default=Path("data/p2d"), help="output folder (default: data/p2d)")
+    parser.add_argument("--out", type=path_argument, default=Path("data/p2d"), help="output folder (default: data/p2d)")
     parser.add_argument(
         "--set", nargs="+", action="extend", default=[], metavar="key=value", help="settings, see below"
     )
@@ -100,20 +100,20 @@ def _parser() -> argparse.ArgumentParser:
 
     command = commands.add_parser("verify", help="check the checksums of a finished folder")
     command.set_defaults(run=_verify)
-    command.add_argument("dir", type=Path)
+    command.add_argument("dir", type=path_argument)
     command.add_argument("--repair", action="store_true", help="generate damaged trajectories again")
     command.add_argument("--workers", type=positive, help="number of processes (default: one per core)")
 
     command = commands.add_parser("card", help="write the data card: Markdown and images")
     command.set_defaults(run=_card)
-    command.add_argument("dir", type=Path)
-    command.add_argument("--out", type=Path, help="folder for the page (default: DIR/card)")
+    command.add_argument("dir", type=path_argument)
+    command.add_argument("--out", type=path_argument, help="folder for the page (default: DIR/card)")
 
     command = commands.add_parser("export", help="write PNGs with COCO-style or MOTChallenge-style ground truth")
     command.set_defaults(run=_export)
-    command.add_argument("dir", type=Path)
+    command.add_argument("dir", type=path_argument)
     command.add_argument("--format", choices=("coco", "mot"), required=True)
-    command.add_argument("--out", type=Path, required=True, help="folder to write; must not exist")
+    command.add_argument("--out", type=path_argument, required=True, help="folder to write; must not exist")
     command.add_argument("--split", nargs="+", choices=SPLITS, default=list(SPLITS))
     return parser
 

@@ -43,7 +43,7 @@ REFUSED = {
     "model.components=2.5": "model.components = 2.5 is wrong: input should be a valid integer.",
     "model.components=1": "model (tests.tiny.Layers): components = 1 leaves no room for an object: give at least 2.",
     "model._target_=tests.tiny.Layer": "model._target_ = 'tests.tiny.Layer' cannot be imported",
-    "model._target_=tests.tiny.SquaresSource": "Unknown key model.components = 3.",
+    "model._target_=tests.tiny.SquaresSource": "model.components is set by the files that were chosen, and tests.tiny.",
     "loss.spred=1": "Unknown key loss.spred: the model has error, spread; did you mean 'spread'?",
     "~loss.spread": "loss.spread is missing: the model needs error, spread.",
     "loss.error=x": "loss.error = 'x' is wrong",
@@ -81,9 +81,13 @@ REFUSED = {
     "+callbacks.x={_target_: builtins.print}": "callbacks.x._target_ = 'builtins.print' is no Callback of Lightning",
     "+logger.x={_target_: tests.tiny.Layers}": "logger.x._target_ = 'tests.tiny.Layers' is no Logger of Lightning",
     "loss.error={_target_: os.getcwd}": "loss.error is not a schedule: choose one of apex_lab.training.schedules.",
-    "loss.error=1e308": "loss.error is 1e+308 at step 0: it must be between 0 and 3.40282e+38.",
-    "lr_scale=1e308": "lr_scale is 1e+308 at step 0: it must be between 0 and 1e+09.",
-    "optimizer.lr=1e308": "optimizer: a learning rate of 1e+308 is wrong: it is at most 1e+09.",
+    "loss.error=1e308": "loss.error = 1e+308 is wrong: no number in single precision is above 3.40282e+38 in size.",
+    "lr_scale=1e38": "lr_scale is 1e+38 at step 0: it must be between 0 and 1e+09.",
+    "lr_scale=-1e308": "lr_scale = -1e+308 is wrong: no number in single precision is above 3.40282e+38 in size.",
+    "optimizer.lr=1e38": "optimizer: a learning rate of 1e+38 is wrong: it is at most 1e+09.",
+    "recipe=null": "recipe=null names no choice of recipe: write one of apex/cpu,",
+    "--shell-completion=x": "--shell-completion goes with one word alone",
+    "schedule.noise._target_=os.getcwd": "is set by the files that were chosen, and os.getcwd does not take it: to",
     "optimizer={_target_: torch.optim.SparseAdam}": "cannot update this model's weights: RuntimeError: Sparse",
     "optimizer={_target_: torch.optim.SGD, eps: 1}": "Unknown key optimizer.eps = 1",
     "paths.outputs=": "paths.outputs = '' is wrong: it is empty, as an unset variable is: give a path.",
@@ -93,7 +97,8 @@ REFUSED = {
     "--experimental-rerun=x": "--experimental-rerun is not read here: the command of a run, typed again, resumes it.",
     "--cfg=nix": "Argument --cfg/-c: invalid choice: 'nix'",
     "--nix": "Unrecognized arguments: --nix.",
-    "hydra.run.dir=/proc/x": "/proc/x: No such file or directory (traceback: ",
+    "hydra.run.dir=/proc/x": "hydra.run.dir or hydra.sweep.dir: /proc/x cannot be written (No such file or directory)",
+    "hydra.output_subdir=/proc/x": "hydra.run.dir or hydra.sweep.dir: /proc/x cannot be written",
     "words": "'words' cannot be read as key=value",
     "x=[1": "'x=[1' cannot be read as key=value",
 }
@@ -124,7 +129,7 @@ def test_every_job_of_a_sweep_is_checked_before_the_first_starts(train: Callable
             "hydra.launcher._target_=nix",
             "hydra.launcher._target_=nix is no launcher of Hydra: choose one by hydra/launcher=...",
         ),
-        ("hydra.sweep.dir=/proc/x", "/proc/x: No such file or directory"),
+        ("hydra.sweep.dir=/proc/x", "hydra.run.dir or hydra.sweep.dir: /proc/x cannot be written (No such file"),
         ("hydra.sweeper.max_batch_size=0", "Unknown key hydra.sweeper.max_batch_size=0."),
         (
             "hydra.sweeper.slots=0",
@@ -143,6 +148,18 @@ def test_choices_that_a_pattern_names(train: Callable[..., Ended], tmp_path: Pat
     refused(train("+ablation=glob(no_*)", "seed=x", "-m"), "seed = 'x' is wrong", tmp_path)
     refused(train("+ablation=glob(x*)", "-m"), "+ablation=glob(x*) fits no choice of ablation.", tmp_path)
     refused(train("model=glob(tin*)", "seed=x", "-m"), "seed = 'x' is wrong", tmp_path)  # in the folder of --config-dir
+
+
+def test_lists_without_end(train: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(train("seed=range(1000000000)", "-m"), "seed=range(1000000000) holds more than 100,000 values", tmp_path)
+    words = ("seed=range(10000)", "trainer.max_steps=range(1,100)", "-m")
+    refused(train(*words), "These words make 990,000 jobs, and one command runs 100,000 at most", tmp_path)
+    refused(train("+sweep=glob(*)", "-m"), "+sweep=glob(*) is a pattern, which fits files of a group alone", tmp_path)
+    refused(
+        train("+sweep=../sweep/paper", "-m"),
+        "sweep=../sweep/paper is no name of a choice: write sweep",
+        tmp_path,
+    )
 
 
 def test_a_key_that_only_swept_models_have(command: Callable[..., Ended], tmp_path: Path) -> None:
@@ -205,7 +222,7 @@ APEX = ("model=apex", "data=p2d", "scale=smoke")
         ("model.hidden=1000000", "model (apex_lab.models.apex.Apex) asks for 12,000.1 GB at once, and"),
         (
             "model.start_mask=1e308",
-            "RuntimeError: value cannot be converted to type float without overflow (trace",
+            "model.start_mask = 1e+308 is wrong: no number in single precision is above 3.40282e+38 in size.",
         ),
         ("model.encoder.depths=[100,100,100,100]", "model.encoder: it has more than 20,000 parts"),
         ("model.background.image_size=64", "model.background.image_size=64 must be that of the model, 32."),

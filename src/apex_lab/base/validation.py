@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import errno
 import inspect
@@ -57,6 +58,18 @@ def to_open(key: str, text: str) -> Path:
         return Path(openable(text))
     except ValueError as error:
         raise UserError(f"{key} = {shown(text)} is wrong: {error}.") from error
+
+
+def path_argument(text: str) -> Path:
+    """A path for an option of `argparse`, which tells what is wrong with it.
+
+    Raises:
+        ArgumentTypeError: no path can be so.
+    """
+    try:
+        return Path(openable(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 PathText = Annotated[str, AfterValidator(openable)]

@@ -174,4 +174,4 @@ def _refuse_misspelt(words: Sequence[str]) -> None:
     for word in words:
         guess = did_you_mean(_key(word), [*DashboardsConfig.model_fields])
         if guess and _key(word) not in CHOICES:
-            raise UserError(f"Unknown key {word.lstrip('+~')}{guess}.")
+            raise UserError(sentence(f"Unknown key {word.lstrip('+~')}{guess}"))

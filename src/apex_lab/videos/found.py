@@ -10,7 +10,7 @@ from apex_lab.base.files import fitting
 from apex_lab.base.order import natural_path_key
 from apex_lab.base.validation import to_open
 from apex_lab.videos.pictures import SUFFIXES, pictures_in
-from apex_lab.videos.reader import Source
+from apex_lab.videos.reader import Source, camera_number
 
 _SUFFIXES = """
     .mp4 .m4v .mov .qt .avi .mkv .webm .wmv .asf .flv .f4v .mpg .mpeg .m2v .mts .m2ts .ts .3gp .3g2 .ogv .ogg .vob .mxf
@@ -33,8 +33,9 @@ def find_videos(patterns: str | Sequence[str]) -> list[Source]:
     """
     found: dict[object, Source] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        if pattern.isdecimal() and not Path(pattern).exists():
-            found.setdefault(int(pattern), int(pattern))
+        if pattern.isdecimal() and not to_open("video", pattern).exists():
+            number = camera_number(pattern)
+            found.setdefault(number, number)
             continue
         for path in _matches(pattern):
             for video in videos_at(path):

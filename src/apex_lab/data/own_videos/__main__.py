@@ -10,6 +10,7 @@ from pathlib import Path
 from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted, interruptible
+from apex_lab.base.validation import path_argument
 from apex_lab.data.own_videos.maker import KIND, ClipMaker, Settings
 from apex_lab.data.own_videos.scan import find, scan
 from recordings import Facts, Plan, RecordingError, read_manifest, repair, verify
@@ -19,7 +20,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Returns the exit code: 0 whole or repaired, 1 failed or damage found, 128 + n after signal n."""
     parser = argparse.ArgumentParser(prog="python -m apex_lab.data.own_videos", description=__doc__)
     command = parser.add_subparsers(required=True, metavar="verify").add_parser("verify", help="check all bytes")
-    command.add_argument("folder", type=Path, help="a folder that `data=video` has made")
+    command.add_argument("folder", type=path_argument, help="a folder that `data=video` has made")
     command.add_argument("--repair", action="store_true", help="cut damaged clips again")
     command.add_argument("--path", help="where the videos are now, if they have been moved")
     command.add_argument("--workers", type=_positive, help="number of processes (default: one per core)")
