@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from apex_lab.config.options import at_home
 from tests.conftest import REPOSITORY, TINY, Ended
 
 REFUSED = {
@@ -190,6 +191,30 @@ def test_home_folders_are_written_out(
     for word in ("paths.outputs=~/runs", "paths.outputs='~/runs'", 'paths.outputs="~/runs"'):
         ended = train(word, "--cfg", "job", "--package", "paths")
         assert f"outputs: {tmp_path / 'my home'}/runs" in " ".join(ended.out.split()), ended.err
+
+
+def test_home_folders_of_commands_that_read_runs(
+    command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "runs").touch()
+    ended = command("status", "--once", "paths.outputs=~/runs")
+    assert f"paths.outputs = {tmp_path}/runs cannot be read (Not a directory)" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("word", "wanted"),
+    [
+        ("a=[~/r,~/s]", "a=[/home/me/r,/home/me/s]"),
+        ("""a=["~/r", '~/s t']""", """a=["/home/me/r", '/home/me/s t']"""),
+        ("a=~/r,~/s t", 'a=/home/me/r,"/home/me/s t"'),
+        ("video='~/a,b.mp4'", "video='/home/me/a,b.mp4'"),
+        *((word, word) for word in ("a=~nobody/x", "~a", "~a=3", "a=b~/c", 'a="x,~/y"', "a=", "a=[]", "~")),
+    ],
+)
+def test_where_a_home_folder_is_meant(word: str, wanted: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    assert at_home(word) == wanted
 
 
 def test_what_is_merged_is_told(train: Callable[..., Ended], tmp_path: Path) -> None:

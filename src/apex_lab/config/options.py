@@ -79,20 +79,29 @@ def passed_on() -> list[str]:
 
 
 def at_home(word: str) -> str:
-    """A word whose value begins with `~` or `~name`, with that folder in place of it.
+    """A word in which `~` or `~name`, at the beginning of its value or of one of several, is that folder.
 
     A shell does this for a word of its own alone, not behind `key=`; Hydra cannot read it, and quoted for Hydra it
     would be the name of a folder.
     """
-    found = re.fullmatch(r"""([^=]+)=(["']?)(~[^"']*)\2""", word)
-    if found is None:
-        return word
-    key, quote, path = found.groups()
-    there = os.path.expanduser(path)
-    if there == path:  # no such user
-        return word
-    return f"{key}={quote}{there}{quote}" if quote or not _SPECIAL.search(there) else f'{key}="{there}"'
 
+    def written_out(found: re.Match[str]) -> str:
+        quote, path = found["quote"] or "", found["quoted"] or found["bare"]
+        there = os.path.expanduser(path)
+        if there == path:  # no such user
+            return found[0]
+        if not quote and _SPECIAL.search(there):
+            quote = '"'
+        return f"{found['before']}{quote}{there}{quote}"
+
+    key, equals, value = word.partition("=")
+    return f"{key}{equals}{_HOME.sub(written_out, value)}"
+
+
+_HOME = re.compile(
+    r"""(?P<before>^|[\[,]\s*)(?:(?P<quote>["'])(?P<quoted>~[^"']*)(?P=quote)|(?P<bare>~[^"',\]]*))(?=\s*(?:[,\]]|$))"""
+)
+"""A value, or one of several, that begins in a home folder."""
 
 _SPECIAL = re.compile(r"[^\w/.:+@%-]")
 """What Hydra does not read in a value without quotes, or reads otherwise."""

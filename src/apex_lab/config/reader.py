@@ -13,6 +13,7 @@ from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import sentence
 from apex_lab.config.command_line import CONFIG_ERROR
+from apex_lab.config.options import at_home
 
 
 class Reader(argparse.ArgumentParser):
@@ -36,8 +37,10 @@ class Reader(argparse.ArgumentParser):
         self.add_argument("--multirun", "-m", action="store_true", help="taken without effect: several values are read")
 
     def asked(self) -> argparse.Namespace:
-        """What is on this process's command line; options may stand anywhere."""
-        return self.parse_intermixed_args(sys.argv[1:])
+        """What is on this process's command line; options may stand anywhere, home folders (`~`) are written out."""
+        asked = self.parse_intermixed_args(sys.argv[1:])
+        asked.words = [at_home(word) for word in asked.words]
+        return asked
 
     def error(self, message: str) -> NoReturn:
         raise UserError(sentence(message))

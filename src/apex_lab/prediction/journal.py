@@ -6,7 +6,6 @@ each closed part, `journal.json` with the number of frames done and the tensors 
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,8 @@ from typing import Any
 import torch
 
 from apex_lab.base import console
-from apex_lab.base.files import make_folder, replacing, write_json
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import make_folder, read_json, replacing, write_json
 from apex_lab.inference.state import Leaf
 
 
@@ -66,10 +66,10 @@ class Journal:
         """
         file = self.folder / "journal.json"
         try:
-            content = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
-        except ValueError:
-            content = None
-        if content is not None and content.get("key") == self.key:
+            content = read_json(file) if file.is_file() else {}
+        except UserError:
+            content = {}
+        if content.get("key") == self.key:
             entry = self._entry(content)
             if entry is not None and whole(entry.done):
                 for part in self.parts[len(content["parts"]) :]:
@@ -105,16 +105,19 @@ class Journal:
             shutil.rmtree(self.folder)
 
     def _entry(self, content: Mapping[str, Any]) -> Entry | None:
-        parts = self.parts
-        if len(parts) < len(content["parts"]) or not content["parts"]:
+        parts, noted = self.parts, content.get("parts")
+        if not isinstance(noted, list) or not noted or len(parts) < len(noted):
             return None
-        if any(_sizes(part) != sizes for part, sizes in zip(parts, content["parts"], strict=False)):
+        if any(_sizes(part) != sizes for part, sizes in zip(parts, noted, strict=False)):
+            return None
+        done, ended, reader = (content.get(name) for name in ("done", "ended", "reader"))
+        if type(done) is not int or type(ended) is not bool or not isinstance(reader, dict):
             return None
         try:
-            tensors = torch.load(self._state(len(content["parts"])), weights_only=True)
+            tensors = torch.load(self._state(len(noted)), weights_only=True)
         except Exception:  # noqa: BLE001 - what is raised for damaged bytes has no common class
             return None
-        return Entry(content["done"], content["ended"], content["reader"], tensors)
+        return Entry(done, ended, reader, tensors)
 
     def _state(self, parts: int) -> Path:
         return self.folder / f"state_{parts:05d}.pt"
