@@ -47,7 +47,7 @@ class CompareConfig(BaseModel):
     fit: Literal["crop", "letterbox"]
     start: int = Field(ge=0)
     every: int = Field(ge=1)
-    frames: int = Field(ge=1)
+    frames: int = Field(ge=1, le=10_000)
     columns: int = Field(ge=1)
     folder: PathText | None
     accelerator: Literal["auto", "cpu", "gpu"]

@@ -87,12 +87,12 @@ REFUSED = {
     "lr_scale=-1e308": "lr_scale = -1e+308 is wrong: no number in single precision is above 3.40282e+38 in size.",
     "optimizer.lr=1e38": "optimizer: a learning rate of 1e+38 is wrong: it is at most 1e+09.",
     "recipe=null": "recipe=null names no choice of recipe: write one of apex/cpu,",
-    "--shell-completion=x": "--shell-completion goes with one word alone",
     "schedule.noise._target_=os.getcwd": "is set by the files that were chosen, and os.getcwd does not take it: to",
     "optimizer={_target_: torch.optim.SparseAdam}": "cannot update this model's weights: RuntimeError: Sparse",
     "optimizer={_target_: torch.optim.SGD, eps: 1}": "Unknown key optimizer.eps = 1",
     "paths.outputs=": "paths.outputs = '' is wrong: it is empty, as an unset variable is: give a path.",
     f"paths.outputs=/{'x' * 5000}": "paths.outputs = '/xxx",
+    "hydra.searchpath=[file:///nowhere]": "hydra.searchpath: /nowhere is not available: give folders that are there.",
     "--resolve": "--resolve goes with --cfg alone: write --cfg job --resolve.",
     "--package=x": "--package goes with --cfg alone",
     "--experimental-rerun=x": "--experimental-rerun is not read here: the command of a run, typed again, resumes it.",
@@ -149,6 +149,11 @@ def test_choices_that_a_pattern_names(train: Callable[..., Ended], tmp_path: Pat
     refused(train("+ablation=glob(no_*)", "seed=x", "-m"), "seed = 'x' is wrong", tmp_path)
     refused(train("+ablation=glob(x*)", "-m"), "+ablation=glob(x*) fits no choice of ablation.", tmp_path)
     refused(train("model=glob(tin*)", "seed=x", "-m"), "seed = 'x' is wrong", tmp_path)  # in the folder of --config-dir
+
+
+def test_shell_completion_of_one_shell(command: Callable[..., Ended], tmp_path: Path) -> None:
+    for words in ((), ("x",), ("install=nix",), ("install=bash", "seed=1")):
+        refused(command("train", "--shell-completion", *words), "goes with one word alone: install=bash,", tmp_path)
 
 
 def test_lists_without_end(train: Callable[..., Ended], tmp_path: Path) -> None:

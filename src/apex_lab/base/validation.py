@@ -125,7 +125,7 @@ def validate(
     Raises:
         UserError: the first fault in one sentence.
     """
-    refuse_large_numbers(values, key)
+    refuse_large_numbers({(names or {}).get(name, name): value for name, value in values.items()}, key)
     try:
         return schema.model_validate_json(json.dumps(values))
     except ValidationError as error:
@@ -173,7 +173,7 @@ def _fault(
     # a hint such as `float | Tensor` has a branch that no written value can take
     here = [f for f in faults if f["loc"][: len(place)] == tuple(place) and f["type"] != "needs_python_object"]
     # where a value is of a kind that is allowed, it does not help to name the other kinds
-    here = [f for f in here if f["type"] == "value_error"] or here
+    here = [f for f in here if f["type"] in _OF_ITS_KIND] or here
     told = [f["msg"].removeprefix("Value error, ") for f in here]
     wanted = (
         ", or ".join(dict.fromkeys(text[:1].lower() + text[1:] for text in told))
@@ -182,6 +182,13 @@ def _fault(
     if not place:
         return sentence(f"{key}: {wanted}" if key else wanted)
     return sentence(f"{full} = {shown(first['input'])} is wrong: {wanted}")
+
+
+_OF_ITS_KIND = (
+    *("value_error", "too_short", "too_long", "string_too_short", "string_pattern_mismatch", "finite_number"),
+    *("greater_than", "greater_than_equal", "less_than", "less_than_equal"),
+)
+"""Faults of a value whose kind is allowed, in pydantic's words."""
 
 
 def _place(values: object, location: tuple[int | str, ...]) -> list[int | str]:

@@ -6,6 +6,7 @@ Seeds of one configuration differ in one number, so a list of jobs is composed o
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -142,8 +143,14 @@ def composing(overrides: Sequence[str], folder: str | None = None) -> Iterator[N
     """
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(version_base="1.3", config_dir=folder or str(conf_dir())):
+        with warnings.catch_warnings(), initialize_config_dir(version_base="1.3", config_dir=folder or str(conf_dir())):
+            warnings.filterwarnings("error", message=_NOT_AVAILABLE)
             yield
+    except UserWarning as error:
+        found = re.match(_NOT_AVAILABLE, str(error))
+        if found is None:
+            raise
+        raise UserError(f"hydra.searchpath: {found[1]} is not available: give folders that are there.") from error
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(told(error, overrides)) from error
     except ValueError as error:
@@ -152,6 +159,10 @@ def composing(overrides: Sequence[str], folder: str | None = None) -> Iterator[N
         raise UserError(_no_choice(overrides)) from error
     finally:
         GlobalHydra.instance().clear()
+
+
+_NOT_AVAILABLE = r"provider=.*, path=(.*) is not available"
+"""What Hydra warns of, in a line of its own code, before it goes on without a folder."""
 
 
 def composed(
@@ -277,7 +288,8 @@ def _no_choice(overrides: Sequence[str]) -> str:
         values = list(override.sweep_iterator()) if override.is_discrete_sweep() else [override.value()]
         folder = conf_dir() / group
         if folder.is_dir() and not all(isinstance(value, str | list) for value in values):
-            known = sorted(path.relative_to(folder).with_suffix("").as_posix() for path in folder.rglob("*.yaml"))
+            files = list(folder.glob("*.yaml")) or folder.rglob("*.yaml")
+            known = sorted(path.relative_to(folder).with_suffix("").as_posix() for path in files)
             return sentence(f"{override.input_line} names no choice of {group}: write one of {', '.join(known)}")
     return "A choice is a word, and one of these is a number or null: " + sentence(" ".join(overrides))
 

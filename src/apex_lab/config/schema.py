@@ -210,12 +210,12 @@ def explain_merged(sentence: str, overrides: Sequence[str]) -> None:
         key, _, value = word.lstrip("+").partition("=")
         part = key.removesuffix("._target_")
         unknown = re.match(rf"Unknown key {re.escape(part)}\.(\w+)", sentence)
-        if unknown is None or f"{part}.{unknown.group(1)}" in typed:
+        if unknown is None:
             continue
         name, rest = f"{part}.{unknown.group(1)}", f"to replace all of it, write ~{part} '+{part}={{...}}'."
-        if part != key:
+        if part != key and name not in typed:
             raise UserError(f"{name} is set by the files that were chosen, and {value} does not take it: {rest}")
-        if value.startswith("{") and unknown.group(1) not in value:
+        if part == key and value.startswith("{") and unknown.group(1) not in value:
             raise UserError(f"{key}={{...}} is merged into what the files set there, {name} among it: {rest}")
 
 

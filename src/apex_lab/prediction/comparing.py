@@ -77,7 +77,8 @@ def clips_of_videos(
     for source in sources:
         video = open_video(source)
         view = framing(video.size, (side, side), fit)
-        taken = [view.fitted(frame.image) for frame in islice(video.frames(start), 0, every * (frames - 1) + 1, every)]
+        chosen = islice(islice(video.frames(start), 0, None, every), frames)
+        taken = [view.fitted(frame.image) for frame in chosen]
         if not taken:
             raise UserError(f"{source} has no frame {start}: give a smaller start.")
         images = torch.from_numpy(np.stack(taken)).permute(0, 3, 1, 2).contiguous()
