@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,6 +9,8 @@ from datetime import timedelta
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from recordings.streams import say
 
 PLAIN_INTERVAL_S = 15.0
 
@@ -46,13 +47,10 @@ def progress(title: str, total: int, unit: str, *, shown: bool = True) -> Iterat
             if plain and not task.finished and time.monotonic() - printed >= PLAIN_INTERVAL_S:
                 printed = time.monotonic()
                 left = "unknown time" if task.time_remaining is None else timedelta(seconds=round(task.time_remaining))
-                say(f"{title}: {task.completed}/{total} {unit} ({task.percentage:.0f}%), {left} left")
-
-        def say(line: str) -> None:
-            print(line, file=sys.stderr, flush=True)
+                say(f"{title}: {task.completed}/{total} {unit} ({task.percentage:.0f}%), {left} left", error=True)
 
         if plain:
-            say(f"{title}: {total} {unit}")
+            say(f"{title}: {total} {unit}", error=True)
         yield advance
         if plain:
-            say(f"{title}: {task.completed} {unit} in {timedelta(seconds=round(task.elapsed or 0))}")
+            say(f"{title}: {task.completed} {unit} in {timedelta(seconds=round(task.elapsed or 0))}", error=True)

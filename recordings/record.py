@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -35,6 +34,7 @@ from recordings.plan import Facts, Kind, Maker, Plan, S
 from recordings.pool import Alone, Pool, Task
 from recordings.progress import progress
 from recordings.readme import README
+from recordings.streams import say
 from recordings.verify import Damage, check, mismatches, note_verified, verify
 from recordings.worker import Job
 
@@ -138,7 +138,7 @@ def _locked(root: Path) -> Iterator[None]:
         try:
             lock.acquire(timeout=0)
         except Timeout:
-            print(f"waiting for another process that works on {root} (Ctrl-C stops waiting)", file=sys.stderr)
+            say(f"waiting for another process that works on {root} (Ctrl-C stops waiting)", error=True)
             lock.acquire(poll_interval=0.2)
         try:
             yield

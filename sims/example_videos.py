@@ -14,10 +14,13 @@ import cv2
 import numpy as np
 
 from recordings.progress import progress
+from recordings.streams import say
 from sims.background import background
 from sims.camera import Camera
+from sims.command import ending, path_argument
 from sims.errors import SimError
 from sims.p2d.settings import Settings
+from sims.p2d.settings_text import SettingsError, settings_from
 from sims.p2d.simulate import simulate
 
 CAMERA = Camera(eye=(1.22, 0.42, 0.72), target=(0.5, -0.03, 0.0), fov_deg=33.0)
@@ -25,33 +28,37 @@ OBJECTS = ("mug", "banana", "cracker_box", "orange", "foam_brick", "mustard_bott
 CLOTH = np.array([0.42, 0.86, 0.72], dtype=np.float32)
 """What the wood's red, green and blue are multiplied by: a green cloth with the table's own shading and shadows."""
 FRAMES_PER_S = 15
+MOST = 10_000
+"""Videos, and frames of a video."""
+
+SCENE = Settings(min_objects=2, max_objects=3, objects=OBJECTS, camera=CAMERA, aim=0.8)
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Writes the videos that are missing; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m sims.example_videos", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--out", type=Path, required=True, help="folder for the MP4 files")
+    parser.add_argument("--out", type=path_argument, required=True, help="folder for the MP4 files")
     parser.add_argument("--videos", type=int, default=20, help="how many (default: 20)")
     parser.add_argument("--frames", type=int, default=48, help="frames per video (default: 48)")
     parser.add_argument("--size", type=int, default=192, help="width in pixels (default: 192)")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
+    return ending(lambda: _run(options), "finished videos are kept, run the same command to resume")
+
+
+def _run(options: argparse.Namespace) -> int:
+    if not 1 <= options.videos <= MOST or not 1 <= options.frames <= MOST:
+        say(f"--videos {options.videos} --frames {options.frames}: give numbers from 1 to {MOST}", error=True)
+        return 2
     try:
-        settings = Settings(
-            seed=options.seed,
-            frames=options.frames,
-            image_size=options.size,
-            min_objects=2,
-            max_objects=3,
-            objects=OBJECTS,
-            camera=CAMERA,
-            aim=0.8,
+        settings = settings_from(
+            [f"seed={options.seed}", f"frames={options.frames}", f"image_size={options.size}"], SCENE
         )
-        write_videos(options.out, settings, options.videos)
-    except (SimError, OSError, ValueError) as error:
-        print(error, file=sys.stderr)
-        return 1
-    print(f"{options.out}: {options.videos} videos")
+    except SettingsError as error:
+        say(str(error), error=True)
+        return 2
+    write_videos(options.out, settings, options.videos)
+    say(f"{options.out}: {options.videos} videos")
     return 0
 
 
@@ -61,7 +68,10 @@ def write_videos(out: Path, settings: Settings, videos: int) -> None:
     Raises:
         SimError: PyBullet is missing, or the video cannot be written.
     """
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SimError(f"{out} cannot be used as a folder ({error.strerror}): choose another") from error
     with progress("example videos", videos, "videos") as advance:
         for index in range(videos):
             path = out / f"push_{index:02d}.mp4"

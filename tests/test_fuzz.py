@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import time
 from collections.abc import Callable
@@ -13,12 +14,25 @@ import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from sims.errors import SimError
 from tests.conftest import REPOSITORY, TINY, Ended
 
 SECONDS = 20.0
 """Of processor time; a machine that does other things beside is not the command's fault."""
 
-GROUPS = ("model", "data", "scale", "trainer", "logger", "callbacks", "paths", "+ablation", "+experiment", "+tuned")
+GROUPS = (
+    "model",
+    "data",
+    "scale",
+    "trainer",
+    "logger",
+    "callbacks",
+    "paths",
+    "+ablation",
+    "+experiment",
+    "+tuned",
+    "+sweep",
+)
 WORDS = ("tiny", "apex", "op3", "squares", "smoke", "cpu", "no_entropy", "overfit", "auto", "csv", "default", "nix")
 KEYS = (
     *("seed", "model", "optimizer", "lr_scale", "schedule", "loss", "data", "clips", "trainer", "logger", "callbacks"),
@@ -34,7 +48,21 @@ KEYS = (
 VALUES = (
     *("", "null", "true", "0", "1", "-1", "2", "3.5", "1e308", "-1e308", "nan", "inf", str(10**30), str(2**63), "x"),
     *("[]", "{}", "[1,2]", "{a:1}", "[[[[]]]]", "'x'", "???", "${seed}", "${nope}", "${oc.env:HOME}", "${x", "'"),
-    *("1,2", "range(2)", "interval(0,1)", "choice(1,x)", "glob(*)", "glob(n*)", "../x", "/proc/x", "~/x", "a=b", "a b"),
+    *(
+        "1,2",
+        "range(2)",
+        "range(1000000000)",
+        "~/a,~/b",
+        "interval(0,1)",
+        "choice(1,x)",
+        "glob(*)",
+        "glob(n*)",
+        "../x",
+        "/proc/x",
+        "~/x",
+        "a=b",
+        "a b",
+    ),
     *(
         "é",
         "\U0001f916",
@@ -158,6 +186,58 @@ def test_keys_of_a_command_s_own(
         st.sampled_from(values),
     )
     ends_well(command, entry, data.draw(st.lists(st.one_of(own, own, own, word), min_size=1, max_size=4)), tmp_path)
+
+
+PROGRAMS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "sims.p2d.__main__": (
+        "generate",
+        ("--out", "--set", "--workers", "--no-card", "verify", "card", "export", "--format", "--split", "--repair"),
+    ),
+    "sims.arrangement_clips.__main__": ("make", ("make", "verify", "--settings", "--workers", "--repair")),
+    "sims.example_videos": ("write_videos", ("--out", "--videos", "--frames", "--size", "--seed")),
+    "apex_lab.data.sketchy.command": (
+        "prepare",
+        ("--root", "--name", "--image-size", "--windows", "--workers", "--repair"),
+    ),
+    "apex_lab.data.own_videos.__main__": ("repair", ("verify", "--repair", "--path", "--workers")),
+}
+"""Command with options of its own -> what its work is called there, and its words."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROGRAMS)
+@cases(30)
+@given(data=st.data())
+def test_programs_with_options(
+    name: str,
+    data: st.DataObject,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    work, own = PROGRAMS[name]
+    values = (*VALUES, str(tmp_path), "/etc/passwd", "/etc", "x", "train=3", "frames=0", "coco", '{"seed": -1}', "full")
+    words = data.draw(st.lists(st.one_of(st.sampled_from(own), st.sampled_from(values)), min_size=1, max_size=6))
+    program = importlib.import_module(name)
+
+    def done(*_: object, **__: object) -> None:
+        raise SimError("work begins")
+
+    monkeypatch.setattr(program, work, done)
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    began = time.process_time()
+    try:
+        code = program.main([word for word in words if "\0" not in word])
+    except SystemExit as stop:
+        code = stop.code
+    except SimError:  # of a command that knows no simulator
+        code = 1
+    said = capsys.readouterr()
+    assert time.process_time() - began < SECONDS
+    assert "Traceback" not in said.out + said.err, said.err
+    assert code in (0, 1, 2, None)
+    assert code in (0, None) or said.err.strip() or said.out.strip()
 
 
 @pytest.mark.slow

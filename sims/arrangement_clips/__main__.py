@@ -8,32 +8,25 @@ import sys
 from pathlib import Path
 
 from recordings import read_manifest, verify
+from recordings.streams import say
 from sims.arrangement_clips.recording import KIND, make, plan, repair
-from sims.errors import SimError
+from sims.command import ending, path_argument, positive
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command; returns the exit code: 0 done, 1 failed or damage found, 2 wrong settings, 130 interrupted."""
+    """Runs one command; returns the exit code: 0 done, 1 failed or damage, 2 wrong settings, 128 + n: signal n."""
     options = _parser().parse_args(arguments)
-    try:
-        code: int = options.run(options)
-    except SimError as error:
-        print(error, file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("interrupted; finished clips are kept, run the same command to resume", file=sys.stderr)
-        return 130
-    return code
+    return ending(lambda: options.run(options), "finished clips are kept, run the same command to resume")
 
 
 def _make(options: argparse.Namespace) -> int:
     try:
         settings = KIND.parse(json.loads(options.settings))
     except ValueError as error:
-        print(f"--settings {options.settings}: {' '.join(str(error).split())}", file=sys.stderr)
+        say(f"--settings {options.settings}: {' '.join(str(error).split())}", error=True)
         return 2
     make(options.dir, settings, options.workers)
-    print(f"{options.dir}: {plan(settings).layout.total_bytes() / 1e9:.2f} GB")
+    say(f"{options.dir}: {plan(settings).layout.total_bytes() / 1e9:.2f} GB")
     return 0
 
 
@@ -41,13 +34,13 @@ def _verify(options: argparse.Namespace) -> int:
     root: Path = options.dir
     damage = repair(root, options.workers) if options.repair else verify(root, read_manifest(root, KIND))
     for line in damage.lines():
-        print(line)
+        say(line)
     if not damage:
-        print(f"{root}: all checksums match")
+        say(f"{root}: all checksums match")
     elif options.repair:
-        print(f"{root}: repaired")
+        say(f"{root}: repaired")
     else:
-        print(f"{root}: damaged: repair it with {KIND.repair_command.format(root=root)}")
+        say(f"{root}: damaged: repair it with {KIND.repair_command.format(root=root)}")
         return 1
     return 0
 
@@ -57,14 +50,14 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(metavar="make | verify", required=True)
     command = commands.add_parser("make", help="make a folder of clips, or resume one")
     command.set_defaults(run=_make)
-    command.add_argument("dir", type=Path)
+    command.add_argument("dir", type=path_argument)
     command.add_argument("--settings", default="{}", help="fields of sims.arrangement_clips.settings.Settings, as JSON")
-    command.add_argument("--workers", type=int, help="number of processes (default: one per core)")
+    command.add_argument("--workers", type=positive, help="number of processes (default: one per core)")
     command = commands.add_parser("verify", help="compare all bytes with their checksums")
     command.set_defaults(run=_verify)
-    command.add_argument("dir", type=Path)
+    command.add_argument("dir", type=path_argument)
     command.add_argument("--repair", action="store_true", help="make damaged clips again")
-    command.add_argument("--workers", type=int, help="number of processes (default: one per core)")
+    command.add_argument("--workers", type=positive, help="number of processes (default: one per core)")
     return parser
 
 

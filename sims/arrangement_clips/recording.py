@@ -16,6 +16,7 @@ from recordings import Damage, Facts, Field, Item, Kind, Layout, Maker, Plan
 from sims import assets
 from sims.arrangement_clips.clip import SPLITS, drawn, sample
 from sims.arrangement_clips.settings import Settings
+from sims.errors import wrong_setting
 
 VERSION = 1
 """Raised whenever the same settings give other bytes."""
@@ -49,7 +50,7 @@ class ClipsKind(Kind[Settings]):
         try:
             return Settings.model_validate_json(json.dumps(data))
         except ValidationError as error:
-            raise ValueError(str(error)) from None
+            raise ValueError(wrong_setting(error, Settings)) from None
 
     def dump(self, settings: Settings) -> dict[str, Any]:
         """Settings as JSON data."""

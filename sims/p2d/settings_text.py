@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import shlex
 from typing import Any
 
 from pydantic import ValidationError
 
-from sims.camera import Camera
-from sims.errors import SimError
+from sims.errors import SimError, wrong_setting
 from sims.p2d.settings import Settings
 
 
@@ -52,19 +50,7 @@ def _no_number(word: str) -> None:
 
 def sentence(error: ValidationError) -> str:
     """The first error of a failed validation as one sentence with the key, the value and the remedy."""
-    first = error.errors()[0]
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        known = sorted(Settings.model_fields)
-        if len(first["loc"]) > 1:  # only the camera has settings of its own
-            known = [f"camera.{name}" for name in sorted(Camera.model_fields)]
-        near = difflib.get_close_matches(key, known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
-        return f"unknown setting {key!r}: {hint}"
-    message = first["msg"].removeprefix("Value error, ")
-    if not key:
-        return f"settings do not fit together: {message}"
-    return f"setting {key}={first['input']!r} is not possible: {message[0].lower() + message[1:]}"
+    return wrong_setting(error, Settings)
 
 
 def command_words(settings: Settings) -> str:

@@ -20,9 +20,9 @@ from apex_lab.arrangement import benchmark
 from apex_lab.arrangement.benchmark import Benchmark
 from apex_lab.arrangement.perception import Perception, Trained
 from apex_lab.arrangement.task import Setting, Task, digest_of
-from apex_lab.base import console
+from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import one_line, sentence, shown, validate
+from apex_lab.base.validation import PathText, one_line, sentence, shown, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import components
 from apex_lab.config import schema as config
@@ -53,7 +53,7 @@ class ArrangeConfig(BaseModel):
     simulation: dict[str, Any]
     workers: int | None = Field(ge=1)
     accelerator: Literal["auto", "cpu", "gpu"]
-    folder: str | None = Field(min_length=1)
+    folder: PathText | None
     again: bool
     trust: bool
     paths: config.PathsPart
@@ -95,7 +95,11 @@ def check_arrangement(raw: dict[str, Any], choices: Mapping[str, str], overrides
     world = _world(asked)
     if "_target_" not in asked.perception:
         raise UserError("perception has no _target_: choose perception=trained, oracle or color_clusters.")
-    components.check(asked.perception, "perception")
+    try:
+        components.check(asked.perception, "perception")
+    except UserError as error:
+        config.explain_merged(str(error), overrides)
+        raise
     perception = components.build(asked.perception, "perception")
     if not isinstance(perception, Perception):
         raise UserError(f"perception._target_ = {shown(asked.perception['_target_'])} is no Perception.")
@@ -182,6 +186,11 @@ def arrange(job: Arrangement) -> None:
                 raise
             console.error(str(error))
             failed[file] = str(error)
+        except Exception as error:
+            if count == 1:
+                raise
+            failed[file] = faults.told(error)
+            console.error(failed[file])
     if failed:
         raise UserError(listed(failed, count).replace("were not evaluated", "were not arranged with"))
 

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import shown, validate
+from apex_lab.base.validation import PathText, shown, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import components
 from apex_lab.config import schema as config
@@ -48,9 +48,9 @@ class CompareConfig(BaseModel):
     fit: Literal["crop", "letterbox"]
     start: int = Field(ge=0)
     every: int = Field(ge=1)
-    frames: int = Field(ge=1)
+    frames: int = Field(ge=1, le=10_000)
     columns: int = Field(ge=1)
-    folder: str | None = Field(min_length=1)
+    folder: PathText | None
     accelerator: Literal["auto", "cpu", "gpu"]
     trust: bool
     paths: config.PathsPart

@@ -122,7 +122,7 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
         raise UserError("checkpoint = [] names no file: give a .ckpt file or a run folder.")
     given = [word.lstrip("+").partition("=")[0] for word in overrides if word.lstrip("+").startswith("data.")]
     data = OtherData(asked.data, tuple(key.removeprefix("data.") for key in given))
-    good, unread = look(files, asked.paths, data, asked.trust)
+    good, unread = look(files, asked.paths, data, asked.trust, asked.batch_size, asked.chunk)
     if len(files) + len(bad) == 1 and good:
         _, stored = load(files[0], asked.paths, data, asked.trust)
         if asked.scoring.masks == "posterior":

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console, faults, interrupts
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import make_folder, unwritable
-from apex_lab.base.validation import validate
+from apex_lab.base.validation import PathText, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import schema as config
 from apex_lab.prediction.load import digest_of, one_file, segmenter_of
@@ -36,7 +36,7 @@ class PredictConfig(BaseModel):
 
     checkpoint: str | None
     video: str | int | list[str | int] | None
-    folder: str | None = Field(min_length=1)
+    folder: PathText | None
     overlay: bool
     masks: Literal["png", "rle"] | None
     tracks: bool

@@ -35,6 +35,41 @@ def test_a_pipe_that_nobody_reads_ends_quietly(monkeypatch: pytest.MonkeyPatch) 
     stream.close()  # what was left over goes nowhere, too
 
 
+def test_what_libraries_print_into_such_a_pipe_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    monkeypatch.setattr(sys, "stdout", open(writer, "w"))  # noqa: SIM115 - closed below
+    console.setup()
+    print("much\n" * 10_000)
+    print("a little", flush=True)
+    sys.stdout.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("train", "--cfg", "job"),
+        ("train", "--help"),
+        ("status", "--once", "+sweep=ablations", "scale=cpu"),
+        ("status", "--help"),
+        ("tables", "+sweep=ablations", "scale=cpu", "dry_run=true"),
+    ],
+)
+def test_commands_into_a_pipe_that_nobody_reads(words: tuple[str, ...], tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as stream:
+        ended = subprocess.run(
+            [sys.executable, "-m", f"apex_lab.{words[0]}", *words[1:]],
+            stdout=stream,
+            stderr=subprocess.PIPE,
+            text=True,
+            cwd=tmp_path,
+        )
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
 def test_a_stream_that_is_closed_leads_nowhere(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdout", None)
     console.setup()

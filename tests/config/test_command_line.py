@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from apex_lab.config.options import at_home
 from tests.conftest import REPOSITORY, TINY, Ended
 
 REFUSED = {
@@ -43,7 +44,7 @@ REFUSED = {
     "model.components=2.5": "model.components = 2.5 is wrong: input should be a valid integer.",
     "model.components=1": "model (tests.tiny.Layers): components = 1 leaves no room for an object: give at least 2.",
     "model._target_=tests.tiny.Layer": "model._target_ = 'tests.tiny.Layer' cannot be imported",
-    "model._target_=tests.tiny.SquaresSource": "Unknown key model.components = 3.",
+    "model._target_=tests.tiny.SquaresSource": "model.components is set by the files that were chosen, and tests.tiny.",
     "loss.spred=1": "Unknown key loss.spred: the model has error, spread; did you mean 'spread'?",
     "~loss.spread": "loss.spread is missing: the model needs error, spread.",
     "loss.error=x": "loss.error = 'x' is wrong",
@@ -81,19 +82,24 @@ REFUSED = {
     "+callbacks.x={_target_: builtins.print}": "callbacks.x._target_ = 'builtins.print' is no Callback of Lightning",
     "+logger.x={_target_: tests.tiny.Layers}": "logger.x._target_ = 'tests.tiny.Layers' is no Logger of Lightning",
     "loss.error={_target_: os.getcwd}": "loss.error is not a schedule: choose one of apex_lab.training.schedules.",
-    "loss.error=1e308": "loss.error is 1e+308 at step 0: it must be between 0 and 3.40282e+38.",
-    "lr_scale=1e308": "lr_scale is 1e+308 at step 0: it must be between 0 and 1e+09.",
-    "optimizer.lr=1e308": "optimizer: a learning rate of 1e+308 is wrong: it is at most 1e+09.",
+    "loss.error=1e308": "loss.error = 1e+308 is wrong: no number in single precision is above 3.40282e+38 in size.",
+    "lr_scale=1e38": "lr_scale is 1e+38 at step 0: it must be between 0 and 1e+09.",
+    "lr_scale=-1e308": "lr_scale = -1e+308 is wrong: no number in single precision is above 3.40282e+38 in size.",
+    "optimizer.lr=1e38": "optimizer: a learning rate of 1e+38 is wrong: it is at most 1e+09.",
+    "recipe=null": "recipe=null names no choice of recipe: write one of apex/cpu,",
+    "schedule.noise._target_=os.getcwd": "is set by the files that were chosen, and os.getcwd does not take it: to",
     "optimizer={_target_: torch.optim.SparseAdam}": "cannot update this model's weights: RuntimeError: Sparse",
     "optimizer={_target_: torch.optim.SGD, eps: 1}": "Unknown key optimizer.eps = 1",
     "paths.outputs=": "paths.outputs = '' is wrong: it is empty, as an unset variable is: give a path.",
     f"paths.outputs=/{'x' * 5000}": "paths.outputs = '/xxx",
+    "hydra.searchpath=[file:///nowhere]": "hydra.searchpath: /nowhere is not available: give folders that are there.",
     "--resolve": "--resolve goes with --cfg alone: write --cfg job --resolve.",
     "--package=x": "--package goes with --cfg alone",
     "--experimental-rerun=x": "--experimental-rerun is not read here: the command of a run, typed again, resumes it.",
     "--cfg=nix": "Argument --cfg/-c: invalid choice: 'nix'",
     "--nix": "Unrecognized arguments: --nix.",
-    "hydra.run.dir=/proc/x": "/proc/x: No such file or directory (traceback: ",
+    "hydra.run.dir=/proc/x": "hydra.run.dir or hydra.sweep.dir: /proc/x cannot be written (No such file or directory)",
+    "hydra.output_subdir=/proc/x": "hydra.run.dir or hydra.sweep.dir: /proc/x cannot be written",
     "words": "'words' cannot be read as key=value",
     "x=[1": "'x=[1' cannot be read as key=value",
 }
@@ -124,7 +130,7 @@ def test_every_job_of_a_sweep_is_checked_before_the_first_starts(train: Callable
             "hydra.launcher._target_=nix",
             "hydra.launcher._target_=nix is no launcher of Hydra: choose one by hydra/launcher=...",
         ),
-        ("hydra.sweep.dir=/proc/x", "/proc/x: No such file or directory"),
+        ("hydra.sweep.dir=/proc/x", "hydra.run.dir or hydra.sweep.dir: /proc/x cannot be written (No such file"),
         ("hydra.sweeper.max_batch_size=0", "Unknown key hydra.sweeper.max_batch_size=0."),
         (
             "hydra.sweeper.slots=0",
@@ -143,6 +149,23 @@ def test_choices_that_a_pattern_names(train: Callable[..., Ended], tmp_path: Pat
     refused(train("+ablation=glob(no_*)", "seed=x", "-m"), "seed = 'x' is wrong", tmp_path)
     refused(train("+ablation=glob(x*)", "-m"), "+ablation=glob(x*) fits no choice of ablation.", tmp_path)
     refused(train("model=glob(tin*)", "seed=x", "-m"), "seed = 'x' is wrong", tmp_path)  # in the folder of --config-dir
+
+
+def test_shell_completion_of_one_shell(command: Callable[..., Ended], tmp_path: Path) -> None:
+    for words in ((), ("x",), ("install=nix",), ("install=bash", "seed=1")):
+        refused(command("train", "--shell-completion", *words), "goes with one word alone: install=bash,", tmp_path)
+
+
+def test_lists_without_end(train: Callable[..., Ended], tmp_path: Path) -> None:
+    refused(train("seed=range(1000000000)", "-m"), "seed=range(1000000000) holds more than 100,000 values", tmp_path)
+    words = ("seed=range(10000)", "trainer.max_steps=range(1,100)", "-m")
+    refused(train(*words), "These words make 990,000 jobs, and one command runs 100,000 at most", tmp_path)
+    refused(train("+sweep=glob(*)", "-m"), "+sweep=glob(*) is a pattern, which fits files of a group alone", tmp_path)
+    refused(
+        train("+sweep=../sweep/paper", "-m"),
+        "sweep=../sweep/paper is no name of a choice: write sweep",
+        tmp_path,
+    )
 
 
 def test_a_key_that_only_swept_models_have(command: Callable[..., Ended], tmp_path: Path) -> None:
@@ -175,6 +198,30 @@ def test_home_folders_are_written_out(
         assert f"outputs: {tmp_path / 'my home'}/runs" in " ".join(ended.out.split()), ended.err
 
 
+def test_home_folders_of_commands_that_read_runs(
+    command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "runs").touch()
+    ended = command("status", "--once", "paths.outputs=~/runs")
+    assert f"paths.outputs = {tmp_path}/runs cannot be read (Not a directory)" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("word", "wanted"),
+    [
+        ("a=[~/r,~/s]", "a=[/home/me/r,/home/me/s]"),
+        ("""a=["~/r", '~/s t']""", """a=["/home/me/r", '/home/me/s t']"""),
+        ("a=~/r,~/s t", 'a=/home/me/r,"/home/me/s t"'),
+        ("video='~/a,b.mp4'", "video='/home/me/a,b.mp4'"),
+        *((word, word) for word in ("a=~nobody/x", "~a", "~a=3", "a=b~/c", 'a="x,~/y"', "a=", "a=[]", "~")),
+    ],
+)
+def test_where_a_home_folder_is_meant(word: str, wanted: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    assert at_home(word) == wanted
+
+
 def test_what_is_merged_is_told(train: Callable[..., Ended], tmp_path: Path) -> None:
     told = "optimizer={...} is merged into what the files set there, optimizer."
     refused(train("++optimizer.muon_lr=0.1", "optimizer={_target_: torch.optim.SGD}"), told, tmp_path)
@@ -205,7 +252,7 @@ APEX = ("model=apex", "data=p2d", "scale=smoke")
         ("model.hidden=1000000", "model (apex_lab.models.apex.Apex) asks for 12,000.1 GB at once, and"),
         (
             "model.start_mask=1e308",
-            "RuntimeError: value cannot be converted to type float without overflow (trace",
+            "model.start_mask = 1e+308 is wrong: no number in single precision is above 3.40282e+38 in size.",
         ),
         ("model.encoder.depths=[100,100,100,100]", "model.encoder: it has more than 20,000 parts"),
         ("model.background.image_size=64", "model.background.image_size=64 must be that of the model, 32."),

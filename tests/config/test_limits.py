@@ -54,6 +54,10 @@ def test_batches_and_lists(monkeypatch: pytest.MonkeyPatch) -> None:
         "evaluation": {"batch_size": 4, "chunk": None},
     }
     limits.refuse_large_batches(config, None)
+    few = {"frames": 10**4, "image_size": 100, "train": 2, "val": 2, "test": 1}
+    limits.refuse_large_videos(few, 10**9, 10, "batch_size")  # there are two videos at most
+    with pytest.raises(UserError, match=r"^batch_size = 1000000000, data.frames = 10000, data.*: 30,000 "):
+        limits.refuse_large_videos({**few, "test": 3}, 10**9, None, "batch_size")
     for part, change, clip, told in (
         (
             "data",
@@ -67,9 +71,3 @@ def test_batches_and_lists(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         with pytest.raises(UserError, match=told):
             limits.refuse_large_batches({**config, part: {**config[part], **change}}, clip)
-
-
-def test_numbers_of_more_than_64_bits() -> None:
-    limits.refuse_long_numbers({"a": [2**63 - 1, -(2**63)], "b": 1e308, "c": None})
-    with pytest.raises(UserError, match=r"^a\.b\[1\] = a whole number of 64 bits is wrong"):
-        limits.refuse_long_numbers({"a": {"b": [1, 2**63]}})

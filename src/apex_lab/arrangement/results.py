@@ -100,7 +100,7 @@ class Store:
             distances = [float(one["distance_m"]) for one in content["objects"]]
             whole = content["identity"] == self.key and len(distances) == task.objects == content["task"]
             return content if whole and content["index"] == task.index else None
-        except (UserError, KeyError, TypeError, ValueError):
+        except (UserError, KeyError, TypeError, ValueError, OverflowError):
             return None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import logging
 import os
 import sys
@@ -104,8 +105,9 @@ def log_to(path: Path) -> Iterator[None]:
 
 
 def _open_streams() -> None:
-    """Lets libraries print too: characters that a terminal lacks are replaced, and a stream that was closed leads
-    nowhere. Its number would otherwise be that of the next file that is opened, into which others then print.
+    """Lets libraries print too: characters that a terminal lacks are replaced, what nobody reads any more is dropped,
+    and a stream that was closed leads nowhere. Its number would otherwise be that of the next file that is opened, into
+    which others then print.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         stream = getattr(sys, name)
@@ -113,8 +115,32 @@ def _open_streams() -> None:
             with contextlib.suppress(OSError):
                 _close_gap(number)
             setattr(sys, name, open(os.devnull, "r" if number == 0 else "w"))  # noqa: SIM115 - for good
+        elif number and type(stream) is io.TextIOWrapper:
+            setattr(sys, name, _Forgiving(stream))
         elif number and getattr(stream, "errors", None) == "strict" and hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")
+            stream.reconfigure(errors="replace")  # of a test or a notebook
+
+
+class _Forgiving(io.TextIOWrapper):
+    """Standard output or error that nobody need read: `print` never raises, nor does the end of the process."""
+
+    def __init__(self, stream: io.TextIOWrapper) -> None:
+        errors = "replace" if stream.errors == "strict" else stream.errors
+        super().__init__(stream.buffer, stream.encoding, errors, None, stream.line_buffering, stream.write_through)
+        self._stream = stream  # which would close the file at its end
+
+    def write(self, text: str) -> int:
+        try:
+            return super().write(text)
+        except (OSError, ValueError):
+            _silence(self)
+            return len(text)
+
+    def flush(self) -> None:
+        try:
+            super().flush()
+        except (OSError, ValueError):
+            _silence(self)
 
 
 def _close_gap(number: int) -> None:

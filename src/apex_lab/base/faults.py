@@ -14,7 +14,7 @@ from pathlib import Path
 
 import apex_lab
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import one_line
+from apex_lab.base.validation import one_line, short
 
 LONGEST = 400
 """Characters of a message that a sentence cites at most; the file has all of it."""
@@ -51,17 +51,12 @@ def told(error: BaseException, where: str = "") -> str:
 def cited(error: BaseException) -> str:
     """Kind and message of an exception on one line of bounded length, without a full stop."""
     if isinstance(error, OSError) and error.strerror and error.filename is not None:
-        text = f"{_short(os.fsdecode(error.filename), LONGEST // 2)}: {error.strerror}"
+        text = f"{short(os.fsdecode(error.filename), LONGEST // 2)}: {error.strerror}"
     else:
         text = one_line(error)
         if text != type(error).__name__:  # else it has no message
             text = f"{type(error).__name__}: {text}"
-    return _short(text, LONGEST).rstrip(".")
-
-
-def _short(text: str, longest: int) -> str:
-    half = longest // 2
-    return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
+    return short(text, LONGEST).rstrip(".")
 
 
 def _stored(error: BaseException) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.validation import one_line, short
 
 DRAFT = re.compile(r"\..+\.\d+\.apex_lab\.part", re.ASCII)
 """Names of files in the making. A kill leaves them; other hidden files are not ours and never removed."""
@@ -82,6 +83,29 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
+def fitting(key: str, pattern: Path) -> Iterator[Path]:
+    """The paths that a pattern with `*` fits.
+
+    Args:
+        key: where the pattern comes from, for the message.
+        pattern: relative, or from the root on.
+
+    Raises:
+        UserError: it is no pattern, or leads through folders that cannot be read.
+    """
+    start = Path(pattern.anchor) if pattern.is_absolute() else Path()
+    try:
+        yield from start.glob(str(pattern.relative_to(pattern.anchor)))
+    except (ValueError, NotImplementedError) as error:
+        raise UserError(
+            f"{key} = {pattern} is no pattern ({error}): give paths, or a pattern such as runs/*."
+        ) from error
+    except OSError as error:
+        raise UserError(
+            f"{key} = {pattern} leads to {error.filename} ({error.strerror}): give a narrower one."
+        ) from error
+
+
 def set_aside(path: Path) -> Path:
     """Renames a damaged file, so that a sound one can take its place; nothing of it is lost.
 
@@ -119,7 +143,8 @@ def unwritable(path: Path, error: OSError) -> UserError:
         return UserError(
             f"No space left for {path}: free some and run the same command again; nothing stored was lost."
         )
-    return UserError(f"{path} cannot be written ({error.strerror or error}): choose another folder or its permissions.")
+    why = error.strerror or one_line(error)
+    return UserError(f"{short(str(path))} cannot be written ({why}): choose another folder or its permissions.")
 
 
 def _sync_folder(folder: Path) -> None:

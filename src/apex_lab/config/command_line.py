@@ -25,6 +25,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base import attached, console, faults, interrupts
 from apex_lab.base.errors import Busy, UserError
+from apex_lab.base.files import unwritable
 from apex_lab.base.interrupts import Interrupted, interruptible
 from apex_lab.base.validation import one_line
 from apex_lab.config import elsewhere
@@ -163,7 +164,7 @@ def _raising() -> Iterator[None]:
     """Inside, Hydra raises what it would print in many lines before it ends the process.
 
     Raises:
-        UserError: Hydra or OmegaConf refused something, in one sentence.
+        UserError: Hydra or OmegaConf refused something, or cannot make its folder, in one sentence.
     """
     before = os.environ.get(_RAISES)
     os.environ[_RAISES] = "1"
@@ -171,6 +172,9 @@ def _raising() -> Iterator[None]:
         yield
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(told(error, options().overrides)) from error
+    except OSError as error:  # what jobs raise does not come here
+        folder = Path(os.fsdecode(error.filename or "."))
+        raise UserError(f"hydra.run.dir or hydra.sweep.dir: {unwritable(folder, error)}") from error
     finally:
         if before is None:
             del os.environ[_RAISES]

@@ -6,6 +6,7 @@ Seeds of one configuration differ in one number, so a list of jobs is composed o
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import did_you_mean, openable, sentence, shown
+from apex_lab.base.validation import did_you_mean, sentence, shown, to_open
 from apex_lab.config import initial, trust
 from apex_lab.config.upgrades import fingerprint
 
@@ -99,14 +100,23 @@ def chosen(runtime: Any) -> dict[str, str]:
     found = {str(k): str(v) for k, v in choices if not str(k).startswith("hydra/") and v is not None}
     for key, word in found.items():
         group, elsewhere, package = key.partition("@")
-        if not _CHOSEN.fullmatch(word):  # such as ../model/apex: it would stand in the name of the run's folder
-            raise UserError(f"{key}={word} is no name of a choice: write {key}={_stem(word)}.")
+        check_choice(key, word)
         if elsewhere:  # no check of a choice would see it
             raise UserError(f"{key}={found[key]}: a choice of {group} has its own place: leave out @{package}.")
     folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
     return {
         group: word for group, word in found.items() if any((at / group / f"{word}.yaml").is_file() for at in folders)
     }
+
+
+def check_choice(group: str, word: str) -> None:
+    """Refuses what is no name of a file in a group, such as ../model/apex: it would name the run's folder too.
+
+    Raises:
+        UserError: the word is none.
+    """
+    if not _CHOSEN.fullmatch(word):
+        raise UserError(f"{group}={word} is no name of a choice: write {group}={_stem(word)}.")
 
 
 _CHOSEN = re.compile(r"\w[\w+-]*(/\w[\w+-]*)*")
@@ -141,8 +151,14 @@ def composing(overrides: Sequence[str], folder: str | None = None) -> Iterator[N
     """
     GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(version_base="1.3", config_dir=folder or str(conf_dir())):
+        with warnings.catch_warnings(), initialize_config_dir(version_base="1.3", config_dir=folder or str(conf_dir())):
+            warnings.filterwarnings("error", message=_NOT_AVAILABLE)
             yield
+    except UserWarning as error:
+        found = re.match(_NOT_AVAILABLE, str(error))
+        if found is None:
+            raise
+        raise UserError(f"hydra.searchpath: {found[1]} is not available: give folders that are there.") from error
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(told(error, overrides)) from error
     except ValueError as error:
@@ -151,6 +167,10 @@ def composing(overrides: Sequence[str], folder: str | None = None) -> Iterator[N
         raise UserError(_no_choice(overrides)) from error
     finally:
         GlobalHydra.instance().clear()
+
+
+_NOT_AVAILABLE = r"provider=.*, path=(.*) is not available"
+"""What Hydra warns of, in a line of its own code, before it goes on without a folder."""
 
 
 def composed(
@@ -234,10 +254,7 @@ def folder_of_runs(value: object) -> Path:
     """
     if not isinstance(value, str):
         raise UserError(f"paths.outputs = {shown(value)} is wrong: give a folder.")
-    try:
-        return Path(openable(value))
-    except ValueError as error:
-        raise UserError(f"paths.outputs = {shown(value)} is wrong: {error}.") from error
+    return to_open("paths.outputs", value)
 
 
 def _check_tuned(choices: Mapping[str, str], runtime: Any) -> None:
@@ -279,7 +296,8 @@ def _no_choice(overrides: Sequence[str]) -> str:
         values = list(override.sweep_iterator()) if override.is_discrete_sweep() else [override.value()]
         folder = conf_dir() / group
         if folder.is_dir() and not all(isinstance(value, str | list) for value in values):
-            known = sorted(path.stem for path in folder.glob("*.yaml"))
+            files = list(folder.glob("*.yaml")) or folder.rglob("*.yaml")
+            known = sorted(path.relative_to(folder).with_suffix("").as_posix() for path in files)
             return sentence(f"{override.input_line} names no choice of {group}: write one of {', '.join(known)}")
     return "A choice is a word, and one of these is a number or null: " + sentence(" ".join(overrides))
 

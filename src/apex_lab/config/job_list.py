@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -32,8 +33,12 @@ from pydantic import BaseModel, ConfigDict
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import validate
 from apex_lab.config import trust
+from apex_lab.config.composition import check_choice
 
 Words = tuple[str, ...]
+
+MOST = 100_000
+"""Jobs of a command; each is composed and checked before the first one starts."""
 
 Value = str | int | float | bool | None
 
@@ -85,7 +90,7 @@ def expand(overrides: Sequence[str], extra: Sequence[str] = ()) -> list[Words]:
         else:
             given[key] = [f"{key}={value}" for value in _values(override)]
     if not sweeps:
-        return [tuple(job) for job in itertools.product(*given.values())]
+        return _product({}, given)
     jobs: list[Words] = []
     for name in sweeps:
         for entry in read_sweep(name, extra):
@@ -106,18 +111,30 @@ def _product(entry: Mapping[str, Sequence[str]], given: Mapping[str, Sequence[st
     """The jobs of one entry under a command's own words."""
     replaced = {key.lstrip("+") for key in given}
     kept = {key: words for key, words in entry.items() if key.lstrip("+") not in replaced}
-    return [tuple(job) for job in itertools.product(*kept.values(), *given.values())]
+    lists = [*kept.values(), *given.values()]
+    if (number := math.prod(len(words) for words in lists)) > MOST:
+        raise UserError(f"These words make {number:,} jobs, and one command runs {MOST:,} at most: name fewer values.")
+    return [tuple(job) for job in itertools.product(*lists)]
 
 
 def _values(override: Override) -> list[str]:
-    """All values of one word as they stand on a command line."""
+    """All values of one word as they stand on a command line.
+
+    Raises:
+        UserError: they cannot be listed, or are too many.
+    """
     if not override.is_sweep_override():
         return [override.get_value_element_as_str()]
     if not override.is_discrete_sweep():
         raise UserError(
             f"{override.input_line} is an interval, which has no list of values: name them, or search by apex_lab.tune."
         )
-    return list(override.sweep_string_iterator())
+    if isinstance(override.value(), Glob) and override.config_loader is None:
+        raise UserError(f"{override.input_line} is a pattern, which fits files of a group alone: name the values.")
+    values = list(itertools.islice(override.sweep_string_iterator(), MOST + 1))
+    if len(values) > MOST:
+        raise UserError(f"{override.input_line} holds more than {MOST:,} values: name fewer.")
+    return values
 
 
 def read_sweep(name: str, extra: Sequence[str] = (), seen: Words = ()) -> list[dict[str, list[str]]]:
@@ -152,6 +169,7 @@ def tables_of(names: Sequence[str], extra: Sequence[str] = ()) -> list[int] | No
 
 
 def _read(name: str, extra: Sequence[str]) -> SweepFile:
+    check_choice("sweep", name)
     try:
         sweep = compose(f"sweep/{name}", overrides=list(extra)).sweep
     except MissingConfigException:

@@ -29,27 +29,8 @@ PARTS = 20_000
 SECONDS = 15.0
 """Processor time of the main thread that building takes at most; the models of this package take less than one."""
 
-LARGEST = 2**63
-"""Whole numbers lie below it in size: NumPy and PyTorch count with 64 bits."""
-
 COPIES = 4
 """Of each weight in training: itself, its gradient, and two running means of an optimiser such as Adam."""
-
-
-def refuse_long_numbers(value: Any, key: str = "") -> None:
-    """Looks for whole numbers that no array could count.
-
-    Raises:
-        UserError: one is there.
-    """
-    if isinstance(value, Mapping):
-        for name, item in value.items():
-            refuse_long_numbers(item, f"{key}.{name}" if key else str(name))
-    elif isinstance(value, list | tuple):
-        for i, item in enumerate(value):
-            refuse_long_numbers(item, f"{key}[{i}]")
-    elif isinstance(value, int) and not -LARGEST <= value < LARGEST:
-        raise UserError(f"{key} = a whole number of {value.bit_length()} bits is wrong: give one of 64 bits at most.")
 
 
 @contextlib.contextmanager
@@ -127,30 +108,49 @@ def refuse_large_batches(config: Mapping[str, Any], clip_frames: int | None) -> 
     data = config["data"]
     frames, side = (_count(data.get(name)) for name in ("frames", "image_size"))
     if frames is not None and side is not None:
-        pixels, sizes = 3 * side * side, ("frames", "image_size")
-        clips = config["clips"]["batch_size"] * (clip_frames or frames)
-        _refuse(4 * clips * pixels, f"a batch of {clips:,} frames", "clips.batch_size", config, sizes)
-        asked = config["evaluation"]
-        whole = asked["batch_size"] * frames  # videos are whole until they are cut into chunks; pixels are bytes then
-        size = whole * pixels + 4 * asked["batch_size"] * min(frames, asked["chunk"] or frames) * pixels
-        _refuse(size, f"{whole:,} frames of whole videos", "evaluation.batch_size", config, sizes)
-    for split in ("train", "val", "test"):
-        if (videos := _count(data.get(split))) is not None:
-            _refuse(64 * videos, f"a list of {videos:,} videos", "", config, (split,))
+        batch = config["clips"]["batch_size"]
+        clips = batch * (clip_frames or frames)
+        keys = {"clips.batch_size": batch, "data.frames": frames, "data.image_size": side}
+        _refuse(4 * clips * 3 * side * side, f"a batch of {clips:,} frames", keys)
+    asked = config["evaluation"]
+    refuse_large_videos(data, asked["batch_size"], asked["chunk"], "evaluation.batch_size")
+
+
+def refuse_large_videos(data: Mapping[str, Any], batch_size: int, chunk: int | None, key: str) -> None:
+    """Compares whole videos, and the lists of videos, with the memory of the machine.
+
+    Args:
+        data: the node of the data set.
+        batch_size: videos at once, where the data set has so many.
+        chunk: frames that a model sees at once; None: all.
+        key: of the batch size, for the message.
+
+    Raises:
+        UserError: they cannot fit.
+    """
+    counts = {f"data.{split}": _count(data.get(split)) for split in ("train", "val", "test")}
+    for split, videos in counts.items():
+        if videos is not None:
+            _refuse(64 * videos, f"a list of {videos:,} videos", {split: videos})
+    frames, side = (_count(data.get(name)) for name in ("frames", "image_size"))
+    if frames is not None and side is not None:
+        pixels, batch = 3 * side * side, batch_size
+        if all(videos is not None for videos in counts.values()):
+            batch = min(batch, max(videos or 0 for videos in counts.values()))
+        whole = batch * frames  # videos are whole until they are cut into chunks; pixels are bytes then
+        size = whole * pixels + 4 * batch * min(frames, chunk or frames) * pixels
+        keys = {key: batch_size, "data.frames": frames, "data.image_size": side}
+        _refuse(size, f"{whole:,} frames of whole videos", keys)
 
 
 def _count(value: Any) -> int | None:
     return value if isinstance(value, int) and not isinstance(value, bool) and value > 0 else None
 
 
-def _refuse(size: int, what: str, batch: str, config: Mapping[str, Any], names: tuple[str, ...]) -> None:
+def _refuse(size: int, what: str, keys: Mapping[str, Any]) -> None:
     if size <= memory():
         return
-    keys = [f"data.{name} = {shown(config['data'][name])}" for name in names]
-    if batch:
-        group, _, key = batch.partition(".")
-        keys.insert(0, f"{batch} = {config[group][key]}")
     raise UserError(
-        f"{', '.join(keys)}: {what} would take {size / GIGABYTE:,.0f} GB, and this machine has "
-        f"{memory() / GIGABYTE:.0f} GB: choose smaller numbers."
+        f"{', '.join(f'{key} = {shown(value)}' for key, value in keys.items())}: {what} would take "
+        f"{size / GIGABYTE:,.0f} GB, and this machine has {memory() / GIGABYTE:.0f} GB: choose smaller numbers."
     )

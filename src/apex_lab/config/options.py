@@ -16,6 +16,8 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.validation import sentence
 from apex_lab.config.composition import full_names
 
+_COMPLETION = re.compile(r"(install|uninstall|query)=(bash|zsh|fish)")
+
 _ALONE = ("run", "multirun", "cfg", "info", "shell_completion")
 
 
@@ -37,6 +39,8 @@ def options() -> argparse.Namespace:
         raise UserError(f"{' and '.join(given)} do not go together: leave out one of them.")
     if asked.resolve and not asked.cfg:
         raise UserError("--resolve goes with --cfg alone: write --cfg job --resolve.")
+    if asked.shell_completion and not (len(asked.overrides) == 1 and _COMPLETION.fullmatch(asked.overrides[0])):
+        raise UserError("--shell-completion goes with one word alone: install=bash, uninstall=zsh or query=fish.")
     if asked.package is not None and not asked.cfg:
         raise UserError("--package goes with --cfg alone: write --cfg job --package ...")
     return asked
@@ -75,20 +79,29 @@ def passed_on() -> list[str]:
 
 
 def at_home(word: str) -> str:
-    """A word whose value begins with `~` or `~name`, with that folder in place of it.
+    """A word in which `~` or `~name`, at the beginning of its value or of one of several, is that folder.
 
     A shell does this for a word of its own alone, not behind `key=`; Hydra cannot read it, and quoted for Hydra it
     would be the name of a folder.
     """
-    found = re.fullmatch(r"""([^=]+)=(["']?)(~[^"']*)\2""", word)
-    if found is None:
-        return word
-    key, quote, path = found.groups()
-    there = os.path.expanduser(path)
-    if there == path:  # no such user
-        return word
-    return f"{key}={quote}{there}{quote}" if quote or not _SPECIAL.search(there) else f'{key}="{there}"'
 
+    def written_out(found: re.Match[str]) -> str:
+        quote, path = found["quote"] or "", found["quoted"] or found["bare"]
+        there = os.path.expanduser(path)
+        if there == path:  # no such user
+            return found[0]
+        if not quote and _SPECIAL.search(there):
+            quote = '"'
+        return f"{found['before']}{quote}{there}{quote}"
+
+    key, equals, value = word.partition("=")
+    return f"{key}{equals}{_HOME.sub(written_out, value)}"
+
+
+_HOME = re.compile(
+    r"""(?P<before>^|[\[,]\s*)(?:(?P<quote>["'])(?P<quoted>~[^"']*)(?P=quote)|(?P<bare>~[^"',\]]*))(?=\s*(?:[,\]]|$))"""
+)
+"""A value, or one of several, that begins in a home folder."""
 
 _SPECIAL = re.compile(r"[^\w/.:+@%-]")
 """What Hydra does not read in a value without quotes, or reads otherwise."""

@@ -18,7 +18,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.validation import did_you_mean, sentence
+from apex_lab.base.validation import did_you_mean, sentence, to_open
 from apex_lab.config.composition import CHOICES, Composed, composed, composing, full_names, not_there, told
 from apex_lab.config.job_list import expand, sweeps, tables_of
 from apex_lab.config.options import at_home, options
@@ -82,7 +82,7 @@ def search_path(config_dir: str | None) -> list[str]:
     """The override that makes Hydra look into the folder given as `--config-dir`."""
     if config_dir is None:
         return []
-    if not Path(config_dir).is_dir():
+    if not to_open("--config-dir", config_dir).is_dir():
         raise UserError(f"--config-dir {config_dir} is not a folder.")
     return [f"hydra.searchpath=[file://{Path(config_dir).resolve()}]"]
 

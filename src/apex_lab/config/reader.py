@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import sentence
 from apex_lab.config.command_line import CONFIG_ERROR
+from apex_lab.config.options import at_home
 
 
 class Reader(argparse.ArgumentParser):
@@ -35,8 +37,10 @@ class Reader(argparse.ArgumentParser):
         self.add_argument("--multirun", "-m", action="store_true", help="taken without effect: several values are read")
 
     def asked(self) -> argparse.Namespace:
-        """What is on this process's command line; options may stand anywhere."""
-        return self.parse_intermixed_args(sys.argv[1:])
+        """What is on this process's command line; options may stand anywhere, home folders (`~`) are written out."""
+        asked = self.parse_intermixed_args(sys.argv[1:])
+        asked.words = [at_home(word) for word in asked.words]
+        return asked
 
     def error(self, message: str) -> NoReturn:
         raise UserError(sentence(message))
@@ -44,7 +48,7 @@ class Reader(argparse.ArgumentParser):
 
 @contextmanager
 def ending(code: int = CONFIG_ERROR) -> Iterator[None]:
-    """Inside, an exception ends the process with one sentence on standard error.
+    """Inside, an exception ends the process with one sentence on standard error, and so does Ctrl-C.
 
     Args:
         code: of the process.
@@ -56,3 +60,6 @@ def ending(code: int = CONFIG_ERROR) -> Iterator[None]:
     except UserError as error:
         console.error(str(error))
         sys.exit(code)
+    except KeyboardInterrupt:
+        console.error("Stopped by SIGINT.")
+        sys.exit(128 + signal.SIGINT)

@@ -182,7 +182,6 @@ def check_job(
     raw = {key: value for key, value in raw.items() if key != "hydra"}
     if "sweep" in raw:
         raise UserError(f"+sweep={choices.get('sweep', '...')} lists several jobs: add -m to run them.")
-    limits.refuse_long_numbers(raw)
     groups = [folder.name for folder in conf_dir().iterdir() if folder.is_dir()]
     config = validate(Config, raw, "", also_known=groups)
     assert isinstance(config, Config)
@@ -195,7 +194,7 @@ def check_job(
         _check_components(config)
     except UserError as error:
         ablations.explain(str(error), choices, conf_dir())
-        _explain_merged(str(error), overrides)
+        explain_merged(str(error), overrides)
         raise
     if not to_train:
         return Job(config, raw, dict(choices), tuple(overrides))
@@ -211,20 +210,29 @@ def check_job(
     return Job(config, raw, dict(choices), tuple(overrides))
 
 
-def _explain_merged(sentence: str, overrides: Sequence[str]) -> None:
-    """A dictionary on the command line is merged into the one in the files, so keys can be unknown that nobody typed.
+def explain_merged(sentence: str, overrides: Sequence[str]) -> None:
+    """A dictionary on the command line is merged into the one in the files, and so is another `_target_`; keys can be
+    unknown then that nobody typed.
+
+    Args:
+        sentence: what a check has said.
+        overrides: the words on the command line.
 
     Raises:
         UserError: that is what has happened.
     """
+    typed = {word.lstrip("+").partition("=")[0] for word in overrides}
     for word in overrides:
         key, _, value = word.lstrip("+").partition("=")
-        unknown = re.match(rf"Unknown key {re.escape(key)}\.(\w+)", sentence)
-        if unknown and value.startswith("{") and unknown.group(1) not in value:
-            raise UserError(
-                f"{key}={{...}} is merged into what the files set there, {key}.{unknown.group(1)} among it: to replace "
-                f"all of it, write ~{key} '+{key}={{...}}'."
-            )
+        part = key.removesuffix("._target_")
+        unknown = re.match(rf"Unknown key {re.escape(part)}\.(\w+)", sentence)
+        if unknown is None:
+            continue
+        name, rest = f"{part}.{unknown.group(1)}", f"to replace all of it, write ~{part} '+{part}={{...}}'."
+        if part != key and name not in typed:
+            raise UserError(f"{name} is set by the files that were chosen, and {value} does not take it: {rest}")
+        if part == key and value.startswith("{") and unknown.group(1) not in value:
+            raise UserError(f"{key}={{...}} is merged into what the files set there, {name} among it: {rest}")
 
 
 def reseeded(job: Job, made: Composed) -> Job:

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json
-from apex_lab.base.validation import did_you_mean, sentence, validate
+from apex_lab.base.validation import PathText, did_you_mean, sentence, validate
 from apex_lab.base.wandb_account import credentials
 from apex_lab.config import command_line as cli
 from apex_lab.config.composition import CHOICES, composing, conf_dir, plain
@@ -47,7 +47,7 @@ class DashboardsConfig(BaseModel):
 
     project: str | None = Field(min_length=1)
     entity: str | None = Field(min_length=1)
-    folder: str | None = Field(min_length=1)
+    folder: PathText | None
     dry_run: bool
 
 
@@ -174,4 +174,4 @@ def _refuse_misspelt(words: Sequence[str]) -> None:
     for word in words:
         guess = did_you_mean(_key(word), [*DashboardsConfig.model_fields])
         if guess and _key(word) not in CHOICES:
-            raise UserError(f"Unknown key {word.lstrip('+~')}{guess}.")
+            raise UserError(sentence(f"Unknown key {word.lstrip('+~')}{guess}"))

@@ -147,8 +147,10 @@ class RecordedSet(VideoSet):
             raise UserError(f"split {self.split} of {self.root} is empty, so it has no median image")
         count = total if sample is None else min(sample, total)
         cache = self.root / f".median_{self.split}_{count}_{self.manifest.content[:8]}.npy"
-        with suppress(OSError, ValueError, EOFError):  # not there, or cut off by a power cut: computed again
-            return torch.from_numpy(np.load(cache, allow_pickle=False))
+        with suppress(OSError, ValueError, EOFError, TypeError, MemoryError):  # not there, or damaged: computed again
+            found = torch.from_numpy(np.load(cache, allow_pickle=False))
+            if found.shape == (3, *self.image_size) and found.dtype == torch.float32:
+                return found
         median = super().median(sample).numpy()
         draft = cache.with_name(f"{cache.name}.{os.getpid()}")
         with suppress(OSError):  # where nothing can be written, it is computed every time

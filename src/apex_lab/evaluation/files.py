@@ -9,7 +9,7 @@ from typing import Any
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence, validate
-from apex_lab.config import components
+from apex_lab.config import components, limits
 from apex_lab.config import schema as config
 from apex_lab.evaluation.other_data import OtherData
 from apex_lab.runs import checkpoints
@@ -19,7 +19,12 @@ __all__ = ["Bad", "find", "here", "listed", "look", "of_another_version"]
 
 
 def look(
-    files: Sequence[Path], paths: config.PathsPart, data: OtherData | None = None, trusted: bool = False
+    files: Sequence[Path],
+    paths: config.PathsPart,
+    data: OtherData | None = None,
+    trusted: bool = False,
+    batch_size: int = 1,
+    chunk: int | None = None,
 ) -> tuple[list[Path], Bad]:
     """Tells the files that look like checkpoints, by their configurations alone, from the others.
 
@@ -30,6 +35,8 @@ def look(
         paths: folders of this machine.
         data: what stands in place of the data that the model was trained with.
         trusted: as of `checkpoints.load`.
+        batch_size: videos that will be read at once.
+        chunk: frames that the model will see at once; None: all.
 
     Returns:
         Those that can be tried, and the others with their reasons.
@@ -41,8 +48,10 @@ def look(
             content = _glance(file, trusted, _stamp(file))
             stored = here(file, content["config"], paths, trusted)
             _checked(file, stored)
+            node = data.instead_of(stored["data"]) if data else stored["data"]
             if data:
-                components.check(data.instead_of(stored["data"]), "data")
+                components.check(node, "data")
+            limits.refuse_large_videos(node, batch_size, chunk, "batch_size")
             good.append(file)
         except UserError as error:
             bad[file] = str(error)

@@ -7,6 +7,7 @@ may be in the file and are passed over. Where the ground truth comes from elsewh
 
 from __future__ import annotations
 
+import io
 import math
 import os
 import zipfile
@@ -30,6 +31,10 @@ _KINDS = {"gt": "ui", "masks": "fuib", "ids": "ui"}
 _LEAST = {"gt": 8, "masks": 4, "ids": 8}
 """Bytes per element that scoring takes at least, whatever the file has."""
 _KIND_NAMES = {"gt": "integers", "masks": "real numbers", "ids": "integers"}
+
+
+_LONGEST_HEADER = 2**16
+"""Bytes; NumPy's own have some hundreds at most."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +167,8 @@ def _split(key: str) -> tuple[str, str]:
 
 
 def _header(archive: zipfile.ZipFile, name: str) -> _Header:
-    with archive.open(name) as file:
+    with archive.open(name) as member:
+        file = io.BytesIO(member.read(_LONGEST_HEADER))  # NumPy would read whatever length a header declares
         version = np.lib.format.read_magic(file)
         read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = read(file)

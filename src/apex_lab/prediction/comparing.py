@@ -90,7 +90,7 @@ def clips_of_videos(
 def _clip(source: Source, side: int, cut: Cut) -> Batch:
     video = open_video(source)
     view = framing(video.size, (side, side), cut.fit)
-    wanted = islice(video.frames(cut.start), 0, cut.every * (cut.frames - 1) + 1, cut.every)
+    wanted = islice(islice(video.frames(cut.start), 0, None, cut.every), cut.frames)
     taken = [view.fitted(frame.image) for frame in wanted]
     if not taken:
         raise UserError(f"{source} has no frame {cut.start}: give a smaller start.")

@@ -6,7 +6,6 @@ each closed part, `journal.json` with the number of frames done and the tensors 
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,7 +15,8 @@ from typing import Any
 import torch
 
 from apex_lab.base import console
-from apex_lab.base.files import make_folder, replacing, write_json
+from apex_lab.base.errors import UserError
+from apex_lab.base.files import make_folder, read_json, replacing, write_json
 from apex_lab.inference.state import Leaf
 
 
@@ -68,10 +68,10 @@ class Journal:
         """
         file = self.folder / "journal.json"
         try:
-            content = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else None
-        except ValueError:
-            content = None
-        if isinstance(content, dict) and content.get("key") == self.key:
+            content = read_json(file) if file.is_file() else {}
+        except UserError:
+            content = {}
+        if content.get("key") == self.key:
             entry = self._entry(content)
             if entry is not None and whole(entry.done):
                 for part in self.parts[len(content["parts"]) :]:
@@ -111,14 +111,17 @@ class Journal:
     def _entry(self, content: Mapping[str, Any]) -> Entry | None:
         try:
             parts, closed = self.parts, content["parts"]
-            if not 0 < len(closed) <= len(parts):
+            if not isinstance(closed, list) or not 0 < len(closed) <= len(parts):
                 return None
             if any(_sizes(part) != sizes for part, sizes in zip(parts, closed, strict=False)):
                 return None
+            done, ended, time, reader = (content[name] for name in ("done", "ended", "time", "reader"))
+            if type(done) is not int or type(ended) is not bool or not isinstance(reader, dict):
+                return None
             tensors = torch.load(self._state(len(closed)), weights_only=True)
-            return Entry(content["done"], content["ended"], content["time"], content["reader"], tensors)
         except Exception:  # noqa: BLE001 - what is raised for damaged bytes has no common class
             return None
+        return Entry(done, ended, time, reader, tensors)
 
     def _state(self, parts: int) -> Path:
         return self.folder / f"state_{parts:05d}.pt"

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_text
-from apex_lab.base.validation import sentence, validate
+from apex_lab.base.validation import PathText, sentence, validate
 from apex_lab.config import preflight
 from apex_lab.config.composition import CHOICES, composing, conf_dir, plain
 from apex_lab.config.reader import Reader, ending
@@ -34,7 +34,7 @@ from apex_lab.report.contents import size_text
 from apex_lab.report.page import render
 from apex_lab.runs.listed import listed
 from apex_lab.tables import definition
-from apex_lab.tables.asked import EVERYTHING, Tables, TablesConfig
+from apex_lab.tables.asked import EVERYTHING, Tables, TablesConfig, check_numbers
 
 FILE = "report.html"
 
@@ -50,7 +50,7 @@ class ReportConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    folder: str | None = Field(min_length=1)
+    folder: PathText | None
     videos: bool
     megabytes: float = Field(ge=0, allow_inf_nan=False)
 
@@ -79,6 +79,8 @@ def write(words: Sequence[str], config_dir: str | None = None) -> Path:
         rest = [EVERYTHING, *rest]
     settings = tables_settings(of_tables)
     jobs = listed(rest, config_dir)
+    specification = definition.load()
+    check_numbers(settings, specification)
     numbers = settings.tables
     if numbers is None and any(_key(word) == "sweep" for word in rest):
         found = preflight.sweep_tables(rest, config_dir)
@@ -88,7 +90,7 @@ def write(words: Sequence[str], config_dir: str | None = None) -> Path:
         words=tuple(rest),
         jobs=tuple(jobs),
         numbers=numbers,
-        specification=definition.load(),
+        specification=specification,
         config_dir=config_dir,
     )
     report = assemble(Asked(rest, words, own.videos, own.megabytes), asked_tables)
@@ -111,7 +113,10 @@ def split(words: Sequence[str]) -> tuple[ReportConfig, list[str], list[str]]:
         key = word.partition("=")[0]
         if key in ReportConfig.model_fields:
             try:
-                values[key] = OverridesParser.create().parse_override(word).value()
+                override = OverridesParser.create().parse_override(word)
+                if override.is_sweep_override():
+                    raise UserError(f"{word} holds several values, and there is one report: give one.")
+                values[key] = override.value()
             except HydraException as error:
                 text = str(error).splitlines()[0]
                 raise UserError(sentence(f"'{word}' cannot be read as key=value: {text}")) from error

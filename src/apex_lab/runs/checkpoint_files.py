@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import glob
 from collections.abc import Sequence
 from pathlib import Path
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import fitting
 from apex_lab.base.order import natural_path_key
-from apex_lab.base.validation import did_you_mean, sentence
+from apex_lab.base.validation import did_you_mean, sentence, to_open
 from apex_lab.config import shipped
 
 Bad = dict[Path, str]
@@ -44,7 +46,7 @@ def find(patterns: Sequence[str]) -> tuple[list[Path], Bad]:
 
 
 def _matches(pattern: str) -> list[Path]:
-    path = Path(pattern)
+    path = to_open("checkpoint", pattern)
     if path.exists():
         return [path]
     if pattern in shipped.NAMES:
@@ -52,8 +54,7 @@ def _matches(pattern: str) -> list[Path]:
     if not any(mark in pattern for mark in "*?"):
         hint = did_you_mean(pattern, shipped.NAMES) or ": give a .ckpt file or a run folder"
         raise UserError(sentence(f"checkpoint = {pattern} does not exist{hint}"))
-    start = Path(path.anchor) if path.is_absolute() else Path()
-    found = sorted(start.glob(str(path.relative_to(path.anchor))), key=natural_path_key)
+    found = sorted(fitting("checkpoint", path), key=natural_path_key)
     if not found:
         raise UserError(f"checkpoint = {pattern} fits nothing: give .ckpt files or run folders.")
     return found
@@ -67,9 +68,8 @@ def _files(path: Path) -> list[Path]:
     if own.is_file():
         return [own]
     # a pattern without * would pass over a link that leads nowhere
-    inside = [
-        file for file in path.rglob("last.ckpt*") if file.name == own.name and file.parent.name == own.parent.name
-    ]
+    files = fitting("checkpoint", Path(glob.escape(str(path))) / "**" / "last.ckpt*")
+    inside = [file for file in files if file.name == own.name and file.parent.name == own.parent.name]
     if not inside:
         raise UserError(
             f"checkpoint = {path} is a folder without checkpoints/last.ckpt, and no run folder is in it: "

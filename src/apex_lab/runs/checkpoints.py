@@ -31,11 +31,11 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import replacing, unwritable
 from apex_lab.base.machine import bounded_memory
 from apex_lab.base.outlines import outline
-from apex_lab.base.validation import shown
+from apex_lab.base.validation import LARGEST, shown
 from apex_lab.config import components, trust
 from apex_lab.config.schema import Config, build_schedules
 from apex_lab.config.upgrades import FORMAT, upgraded
-from apex_lab.runs.record import LARGEST, Kept
+from apex_lab.runs.record import Kept
 from apex_lab.scene import SceneModel
 
 _KEYS = {

@@ -210,9 +210,10 @@ class Run:
 
     def _share_of_results(self) -> float | None:
         try:
-            return read_json(self.metrics_file).get("validation_foreground_share")
+            share = read_json(self.metrics_file).get("validation_foreground_share")
         except UserError:
             return None
+        return float(share) if isinstance(share, float | int) and 0 <= share <= 1 else None
 
     def update(self, **entries: Any) -> None:
         """Changes entries of the record."""

@@ -10,10 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
-from apex_lab.base.validation import validate
-
-LARGEST = 2**63
-"""Counts lie below it."""
+from apex_lab.base.validation import LARGEST, validate
 
 
 class Start(BaseModel):

@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_json, write_text
-from apex_lab.base.validation import PathText, did_you_mean, shown, validate
+from apex_lab.base.validation import PathText, did_you_mean, sentence, shown, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import preflight
 from apex_lab.config.composition import CHOICES, composing, plain
@@ -146,10 +146,7 @@ def asked(words: Sequence[str], config_dir: str | None = None) -> Tables:
         assert isinstance(settings, TablesConfig)
         rest = rest if sweeps(rest) else [EVERYTHING, *rest]
     specification = spec.load()
-    numbers = [table.number for table in specification.tables]
-    for number in settings.tables or ():
-        if number not in numbers:
-            raise UserError(f"tables = {shown(settings.tables)} is wrong: there are {', '.join(map(str, numbers))}.")
+    check_numbers(settings, specification)
     try:
         jobs = listed(rest, config_dir)
     except UserError:
@@ -165,6 +162,18 @@ def asked(words: Sequence[str], config_dir: str | None = None) -> Tables:
     )
 
 
+def check_numbers(settings: TablesConfig, specification: spec.Specification) -> None:
+    """Refuses numbers that no table has.
+
+    Raises:
+        UserError: there is one.
+    """
+    numbers = [table.number for table in specification.tables]
+    for number in settings.tables or ():
+        if number not in numbers:
+            raise UserError(f"tables = {shown(settings.tables)} is wrong: there are {', '.join(map(str, numbers))}.")
+
+
 def _key(word: str) -> str:
     return word.partition("=")[0].lstrip("+~")
 
@@ -174,7 +183,7 @@ def _refuse_misspelt(words: Sequence[str]) -> None:
     for word in words:
         guess = did_you_mean(_key(word), [*TablesConfig.model_fields])
         if guess and _key(word) not in CHOICES:
-            raise UserError(f"Unknown key {word.lstrip('+~')}{guess}.")
+            raise UserError(sentence(f"Unknown key {word.lstrip('+~')}{guess}"))
 
 
 def assemble(job: Tables) -> Made:

@@ -138,7 +138,7 @@ def read_arrangement(run: SeedRun) -> dict[str, list[list[float]]] | None:
         raise UserError(f"{file} has no 'distances_m': remove it and arrange again.")
     found: dict[str, list[list[float]]] = {}
     for objects, scenarios in tasks.items():
-        if not objects.isdecimal() or not isinstance(scenarios, list):
+        if not re.fullmatch("[1-9][0-9]{0,3}", objects) or not isinstance(scenarios, list):
             raise UserError(
                 f"{file}: distances_m.{objects} is wrong: a list of scenarios per number of objects is wanted."
             )
@@ -162,7 +162,7 @@ def read_failures(run: SeedRun) -> dict[str, tuple[int, int, dict[str, int]]]:
         try:
             reasons = {str(reason): int(count) for reason, count in task["failures"].items()}
             found[str(objects)] = (sum(reasons.values()), int(task["objects"]), reasons)
-        except (KeyError, TypeError, ValueError, AttributeError):
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError):
             continue
     return found
 

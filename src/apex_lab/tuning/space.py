@@ -8,6 +8,7 @@ key=choice(a,b,c)  key=a,b,c     one of these
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,6 +24,9 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence
 
 Value = str | int | float | bool
+
+MOST = 1_000_000
+"""Values of a range."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +164,9 @@ def _range(sweep: RangeSweep, word: str) -> BaseDistribution:
     log = _log(sweep, word)
     if sweep.step == 0:
         raise UserError(f"{word}: the step of a range is not 0.")
-    values = list(sweep.range())
+    values = list(itertools.islice(sweep.range(), MOST + 1))
+    if len(values) > MOST:
+        raise UserError(f"{word}: a range holds {MOST:,} values at most; write interval(...).")
     if not values:
         raise UserError(f"{word}: this range is empty.")
     low, high, step = min(values), max(values), abs(sweep.step)

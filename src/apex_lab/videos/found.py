@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import fitting
 from apex_lab.base.order import natural_path_key
+from apex_lab.base.validation import to_open
 from apex_lab.videos.pictures import SUFFIXES, pictures_in
-from apex_lab.videos.reader import Source
+from apex_lab.videos.reader import Source, camera_number
 
 _SUFFIXES = """
     .mp4 .m4v .mov .qt .avi .mkv .webm .wmv .asf .flv .f4v .mpg .mpeg .m2v .mts .m2ts .ts .3gp .3g2 .ogv .ogg .vob .mxf
@@ -33,8 +35,9 @@ def find_videos(patterns: str | Sequence[str]) -> list[Source]:
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
         if not pattern.strip():
             raise UserError("video is empty: give a file, a folder, a pattern with * or a camera (0).")
-        if pattern.isdecimal() and not Path(pattern).exists():
-            found.setdefault(int(pattern), int(pattern))
+        if pattern.isdecimal() and not to_open("video", pattern).exists():
+            number = camera_number(pattern)
+            found.setdefault(number, number)
             continue
         for path in _matches(pattern):
             for video in videos_at(path):
@@ -75,13 +78,12 @@ def listed(failed: Mapping[Source, str], count: int, done: str) -> str:
 
 
 def _matches(pattern: str) -> list[Path]:
-    path = Path(pattern).expanduser()
+    path = to_open("video", pattern).expanduser()
     if path.exists():
         return [path]
     if not any(mark in pattern for mark in "*?["):
         raise UserError(f"video = {pattern} does not exist: give a file, a folder, a pattern with * or a camera (0).")
-    start = Path(path.anchor) if path.is_absolute() else Path()
-    found = [each for each in start.glob(str(path.relative_to(path.anchor))) if _plausible(each)]
+    found = [each for each in fitting("video", path) if _plausible(each)]
     if not found:
         raise UserError(f"video = {pattern} fits nothing: give video files or folders of pictures.")
     return sorted(found, key=natural_path_key)

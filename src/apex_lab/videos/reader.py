@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.validation import short
 from apex_lab.videos.pictures import is_picture, pages_of, pictures_in, read_pages
 
 Source = Path | int
@@ -106,7 +107,7 @@ def open_video(source: Source | str) -> Video:
         UserError: missing, empty, no video, damaged: one sentence that names it.
     """
     if isinstance(source, int) or (isinstance(source, str) and source.isdecimal() and not Path(source).exists()):
-        return Camera(int(source))
+        return Camera(camera_number(source))
     path = Path(source)
     if path.is_dir():
         return PictureFolder(path)
@@ -119,6 +120,18 @@ def open_video(source: Source | str) -> Video:
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}): choose its permissions.") from error
     return PictureFile(path) if is_picture(path) else VideoFile(path)
+
+
+def camera_number(source: str | int) -> int:
+    """The number of a camera.
+
+    Raises:
+        UserError: no camera has it.
+    """
+    digits = str(source)
+    if not digits.isdecimal() or len(digits) > 9:
+        raise UserError(f"video = {short(digits)} is no camera: they are numbered from 0 on.")
+    return int(digits)
 
 
 class VideoFile(Video):

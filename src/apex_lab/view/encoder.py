@@ -22,6 +22,9 @@ from apex_lab.base.files import unwritable
 NEAR_LOSSLESS = ("-crf", "16", "-preset", "slow")
 """For small movies: thin outlines survive."""
 
+SLOWEST = 0.01
+"""Frames per second: ffmpeg is told two decimals."""
+
 FAST = ("-crf", "20", "-preset", "veryfast")
 """For long videos."""
 
@@ -53,7 +56,7 @@ class Mp4:
     Args:
         path: ends in .mp4.
         size: (H, W) in pixels; a row or column is repeated where they are odd.
-        fps: frames per second.
+        fps: frames per second; one in `1 / SLOWEST` seconds at least.
         quality: options of x264.
 
     Raises:
@@ -68,7 +71,7 @@ class Mp4:
         self._encoder: Any = imageio_ffmpeg.write_frames(
             str(path),
             (size[1] + size[1] % 2, size[0] + size[0] % 2),
-            fps=fps,
+            fps=max(fps, SLOWEST),
             codec="libx264" if h264 else "mpeg4",
             pix_fmt_out="yuv420p",
             quality=None,

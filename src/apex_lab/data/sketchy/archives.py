@@ -121,7 +121,7 @@ def _extracted_before(place: Path) -> Extracted | None:
     try:
         before = Extracted(**json.loads((place / DONE).read_text()))
         whole = all((place / name).is_file() for name in before.episodes)
-    except (OSError, ValueError, TypeError):
+    except (OSError, ValueError, TypeError, RecursionError):
         return None
     return before if whole else None
 

@@ -8,9 +8,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from apex_lab.base import console
+from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted, interruptible
+from apex_lab.base.validation import path_argument
 from apex_lab.data.sketchy.prepare import EXTRACTED, Request, prepare, repair_recording
 from apex_lab.data.sketchy.recording import COMMAND
 from apex_lab.data.sketchy.split import SPLITS
@@ -60,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     console.setup()
     request = Request(options.folder, options.root, options.name, options.image_size, options.windows, options.workers)
     try:
-        with interruptible():
+        with faults.net(), interruptible():
             (_repair if options.repair else _prepare)(request)
     except UserError as error:
         console.error(str(error))
@@ -93,9 +94,11 @@ def _parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     parser.add_argument(
-        "folder", type=Path, metavar="FOLDER", help="episodes or .tar.bz2 archives, also in sub-folders"
+        "folder", type=path_argument, metavar="FOLDER", help="episodes or .tar.bz2 archives, also in sub-folders"
     )
-    parser.add_argument("--root", type=Path, default=Path("data"), help="folder of all data sets (default: data)")
+    parser.add_argument(
+        "--root", type=path_argument, default=Path("data"), help="folder of all data sets (default: data)"
+    )
     parser.add_argument("--name", type=_name, default="demos", help="of the recording: data.name (default: demos)")
     parser.add_argument(
         "--image-size", type=_size, default=128, metavar="SIZE", help="height and width in pixels (default: 128)"
