@@ -1,0 +1,132 @@
+"""Any command, killed at random moments and started again: what it leaves, and what it ends with."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from apex_lab.runs.state import read_state
+from tests.fakes.own_videos import write_video
+from tests.kills import works
+from tests.kills.processes import Ended, Measured, Moment, Running, Tally, drawn, untold
+from tests.kills.works import WORKS, Work
+
+SEED = os.environ.get("KILLS_SEED", "0")
+"""Another seed draws other moments."""
+
+EVERY = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, None)
+
+FAST = {"training": 3, "evaluation": 2, "prediction": 2, "sweep": 2, "training with pictures": 1}
+"""Kills of the default suite; docs/reliability.md counts them."""
+
+SLOW = {
+    **{"training": 8, "training with loaders": 5, "training with pictures": 6, "own videos": 8, "evaluation": 10},
+    **{"prediction": 12, "sweep": 8, "simulation": 10, "arrangement clips": 8, "arrangement": 6},
+    **{"arrangement video": 4},
+    **{f"training {model}": 5 for model in works.MODELS},
+}
+
+
+@pytest.fixture(scope="session")
+def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What commands read: a trained model, a video, a folder of videos."""
+    folder = tmp_path_factory.mktemp("inputs")
+    ended = Running(works.TRAIN, (*works.TINY, "trainer.max_steps=4", "data.test=6"), folder).end()
+    assert ended.code == 0, ended.said
+    [run] = folder.glob("outputs/*/seed_0")
+    shutil.copy(run / "checkpoints" / "last.ckpt", folder / "last.ckpt")
+    write_video(folder / "clip.mp4", 0, 14)
+    (folder / "videos").mkdir()
+    for number in range(10):
+        write_video(folder / "videos" / f"{number}.avi", number, 14)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def unbroken(
+    inputs: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Callable[[str], tuple[dict[str, object], Measured]]:
+    """What a command leaves that nothing disturbs, and what it takes."""
+    found: dict[str, tuple[dict[str, object], Measured]] = {}
+
+    def of(name: str) -> tuple[dict[str, object], Measured]:
+        if name not in found:
+            folder = tmp_path_factory.mktemp("unbroken")
+            ended = started(WORKS[name], folder, inputs).end()
+            assert ended.code == 0, ended.said
+            found[name] = WORKS[name].results(folder), ended.measured
+            assert found[name][0]
+            assert not works.not_whole(folder)  # the reader itself accepts what is whole
+        return found[name]
+
+    return of
+
+
+def started(work: Work, folder: Path, inputs: Path, moment: Moment | None = None) -> Running:
+    """A command at work in a folder."""
+    folder.mkdir(exist_ok=True)
+    words = [word.replace("{inputs}", str(inputs)) for word in work.words]
+    return Running(work.entry, words, folder, moment, work.variables)
+
+
+def check(folder: Path, moment: Moment, ended: Ended, told: str) -> None:
+    """What must hold after every kill."""
+    assert untold(moment, ended) is None, f"{untold(moment, ended)}: {told}\n{ended.said}"
+    assert works.not_whole(folder) == [], told
+    states = {str(file.parent): read_state(file.parent).state for file in folder.rglob("run.json")}
+    assert "running" not in states.values(), (states, told)
+    assert "damaged" not in states.values(), (states, told)
+
+
+def kill(name: str, kills: int, folder: Path, inputs: Path, whole: tuple[dict[str, object], Measured]) -> Tally:
+    """Kills a command again and again, lets it end, and compares; what was done."""
+    work, (expected, measured) = WORKS[name], whole
+    draw, tally = random.Random(f"{SEED} {name}"), Tally(SEED)
+    place, rounds = folder / "round_0", 0
+    while tally.count < kills:
+        assert len(tally.moments) < 6 * kills + 10, f"{tally} {tally.moments}"
+        moment = drawn(draw, measured, EVERY, work.workers)
+        ended = started(work, place, inputs, moment).end()
+        told = f"{name}, {tally}, {tally.moments}, {moment}"
+        if tally.add(moment, ended):
+            check(place, moment, ended, told)
+            continue
+        compare(work, place, expected, told)
+        rounds += 1
+        place = folder / f"round_{rounds}"
+    ended = started(work, place, inputs).end()
+    told = f"{name}, {tally}, {tally.moments}"
+    assert ended.code == 0, f"{told}\n{ended.said}"
+    compare(work, place, expected, told)
+    return tally
+
+
+def compare(work: Work, folder: Path, expected: dict[str, object], told: str) -> None:
+    """A finished command has left what the unbroken one has left, and nothing in the making."""
+    found = work.results(folder)
+    assert found.keys() == expected.keys(), told
+    assert [key for key in found if found[key] != expected[key]] == [], told
+    assert works.in_the_making(folder) == [], told
+    assert works.not_whole(folder) == [], told
+
+
+@pytest.mark.parametrize("name", FAST)
+def test_killed_at_random_moments_it_ends_as_unbroken(
+    name: str, tmp_path: Path, inputs: Path, unbroken: Callable[[str], tuple[dict[str, object], Measured]]
+) -> None:
+    print(name, kill(name, FAST[name], tmp_path, inputs, unbroken(name)))
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", SLOW)
+def test_killed_often_it_ends_as_unbroken(
+    name: str, tmp_path: Path, inputs: Path, unbroken: Callable[[str], tuple[dict[str, object], Measured]]
+) -> None:
+    print(name, kill(name, SLOW[name], tmp_path, inputs, unbroken(name)))
