@@ -6,7 +6,11 @@
 
 from __future__ import annotations
 
+import _pyio
 import atexit
+import builtins
+import errno
+import io
 import json
 import multiprocessing
 import os
@@ -14,6 +18,7 @@ import random
 import resource
 import runpy
 import signal
+import stat
 import sys
 import time
 import traceback
@@ -93,6 +98,7 @@ class Running:
         folder: where it runs.
         moment: when it is to be killed.
         variables: of its environment, beside those of this process.
+        writes: how many writes to files in its folder succeed before its disk is full; None: it never is.
     """
 
     count = 0
@@ -104,13 +110,14 @@ class Running:
         folder: Path,
         moment: Moment | None = None,
         variables: Mapping[str, str] | None = None,
+        writes: int | None = None,
     ) -> None:
         Running.count += 1
         self.folder, self.moment = folder, moment
         self.log = folder.parent / f".{folder.name}_{Running.count}.log"
         order = {
             **{"entry": entry, "words": list(words), "folder": str(folder), "log": str(self.log)},
-            **{"variables": dict(variables or {}), "moment": moment},
+            **{"variables": dict(variables or {}), "moment": moment, "writes": writes},
         }
         self.process = SERVER.Process(target=_command, args=(order,))
         self.process.start()
@@ -192,7 +199,9 @@ def _command(order: dict[str, Any]) -> None:
     for number, file in enumerate((nowhere, log, log)):
         os.dup2(file, number)
     sys.stdin = open(0, closefd=False)  # noqa: SIM115 - multiprocessing has closed it
-    counted = _count_changes(order["moment"])
+    counted, runs = _count_changes(order["moment"]), [True]
+    if order["writes"] is not None:
+        _fill_up(Path(order["folder"]), order["writes"], runs)
     before = _address_space()
     _limit(order["moment"], before)
     sys.argv = [order["entry"], *order["words"]]
@@ -206,6 +215,7 @@ def _command(order: dict[str, Any]) -> None:
         raise
     finally:
         atexit._run_exitfuncs()  # which multiprocessing does not
+        runs[0] = False
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         about = {"changes": counted[0], "growth": _address_space("VmPeak") - before}
         Path(order["log"]).with_suffix(".json").write_text(json.dumps(about))
@@ -230,6 +240,29 @@ def _count_changes(moment: Moment | None) -> list[int]:
 
     sys.addaudithook(hook)
     return counted
+
+
+def _fill_up(folder: Path, writes: int, runs: list[bool]) -> None:
+    """Lets the disk of a folder be full after so many writes, while the command runs.
+
+    Python's own files are then written in Python, through `os.write`.
+    """
+    left, real, place = [writes], {name: getattr(os, name) for name in ("write", "pwrite")}, folder.stat().st_dev
+
+    def full(name: str) -> Callable[..., int]:
+        def write(file: int, *rest: Any) -> int:
+            about = os.fstat(file)
+            if file > 2 and stat.S_ISREG(about.st_mode) and about.st_dev == place:
+                left[0] -= 1
+                if left[0] < 0 and runs[0]:
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return int(real[name](file, *rest))
+
+        return write
+
+    for name in real:
+        setattr(os, name, full(name))
+    builtins.open = io.open = _pyio.open  # type: ignore[assignment]
 
 
 def _limit(moment: Moment | None, before: int) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import random
-import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from apex_lab.runs.state import read_state
-from tests.fakes.own_videos import write_video
 from tests.kills import works
 from tests.kills.processes import Ended, Measured, Moment, Running, Tally, drawn, untold
 from tests.kills.works import WORKS, Work
@@ -31,41 +29,6 @@ SLOW = {
     **{"arrangement video": 4},
     **{f"training {model}": 5 for model in works.MODELS},
 }
-
-
-@pytest.fixture(scope="session")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What commands read: a trained model, a video, a folder of videos."""
-    folder = tmp_path_factory.mktemp("inputs")
-    ended = Running(works.TRAIN, (*works.TINY, "trainer.max_steps=4", "data.test=6"), folder).end()
-    assert ended.code == 0, ended.said
-    [run] = folder.glob("outputs/*/seed_0")
-    shutil.copy(run / "checkpoints" / "last.ckpt", folder / "last.ckpt")
-    write_video(folder / "clip.mp4", 0, 14)
-    (folder / "videos").mkdir()
-    for number in range(10):
-        write_video(folder / "videos" / f"{number}.avi", number, 14)
-    return folder
-
-
-@pytest.fixture(scope="session")
-def unbroken(
-    inputs: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Callable[[str], tuple[dict[str, object], Measured]]:
-    """What a command leaves that nothing disturbs, and what it takes."""
-    found: dict[str, tuple[dict[str, object], Measured]] = {}
-
-    def of(name: str) -> tuple[dict[str, object], Measured]:
-        if name not in found:
-            folder = tmp_path_factory.mktemp("unbroken")
-            ended = started(WORKS[name], folder, inputs).end()
-            assert ended.code == 0, ended.said
-            found[name] = WORKS[name].results(folder), ended.measured
-            assert found[name][0]
-            assert not works.not_whole(folder)  # the reader itself accepts what is whole
-        return found[name]
-
-    return of
 
 
 def started(work: Work, folder: Path, inputs: Path, moment: Moment | None = None) -> Running:

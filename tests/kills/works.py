@@ -131,8 +131,10 @@ def _frames(file: Path) -> int:
 def evaluations(folder: Path) -> dict[str, Any]:
     """Scores and exported files of evaluations."""
     found: dict[str, Any] = {}
-    for file in sorted(folder.rglob("*")):
+    for file in sorted(folder.rglob("[!.]*")):
         name = str(file.relative_to(folder))
+        if "/." in name:
+            continue
         if file.name == "metrics.json":
             found[name] = json.loads(file.read_text())["splits"]
         elif file.suffix in (".csv", ".npz"):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import apex_lab
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import is_full, unwritable
 from apex_lab.base.validation import one_line
 
 LONGEST = 400
@@ -45,6 +46,8 @@ def told(error: BaseException, where: str = "") -> str:
         error: the exception.
         where: the key or file at hand.
     """
+    if isinstance(error, OSError) and is_full(error) and error.filename is not None:
+        return str(unwritable(Path(os.fsdecode(error.filename)), error))
     return f"{where}{': ' if where else ''}{cited(error)} ({_stored(error)})."
 
 

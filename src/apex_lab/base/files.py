@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -113,13 +114,41 @@ def make_folder(path: Path) -> Path:
     return path
 
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""What a system says of a disk, a share of it or a file that may not grow."""
+
+
+def is_full(error: OSError) -> bool:
+    """Whether there is no room; other programs say so in words alone."""
+    return error.errno in FULL or os.strerror(errno.ENOSPC) in str(error)
+
+
 def unwritable(path: Path, error: OSError) -> UserError:
     """The sentence for a file that could not be written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if is_full(error):
+        cause = "" if error.errno in (errno.ENOSPC, None) else f"{os.strerror(error.errno)}; "
         return UserError(
-            f"No space left for {path}: free some and run the same command again; nothing stored was lost."
+            f"No space left for {path} ({cause}{free_space(path)}): free some and run the same command again; "
+            "nothing stored was lost."
         )
     return UserError(f"{path} cannot be written ({error.strerror or error}): choose another folder or its permissions.")
+
+
+def free_space(path: Path) -> str:
+    """How much is free where a file is or would be, in words."""
+    there = next((folder for folder in (path, *path.absolute().parents) if folder.exists()), Path())
+    try:
+        return f"{readable_size(shutil.disk_usage(there).free)} free there"
+    except OSError as error:
+        return f"what is free there cannot be told: {error.strerror}"
+
+
+def readable_size(count: int) -> str:
+    """Bytes in the unit a person would use."""
+    for size, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count} bytes"
 
 
 def _sync_folder(folder: Path) -> None:

@@ -145,6 +145,7 @@ def _evaluate(
     view = folder / "view" / request.split
     done = None if request.again else _done(folder, request, key)
     if done is not None:
+        _parts(request, folder, key).remove()  # a kill may have come between the results and this
         console.say(f"evaluated already (again=true does it once more): {folder / 'metrics.json'}")
         pictures = sorted(view.glob("*"), key=_film_strip_first) if done.get("pictures") else []
         exported = [export_path(folder, request.split, request.export)] if request.export is not None else []
