@@ -10,20 +10,17 @@ from pathlib import Path
 from recordings import read_manifest, verify
 from sims.arrangement_clips.recording import KIND, make, plan, repair
 from sims.errors import SimError
+from sims.stopping import stoppable
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs one command; returns the exit code: 0 done, 1 failed or damage found, 2 wrong settings, 130 interrupted."""
+    """Runs one command; returns the exit code: 0 done, 1 failed or damage, 2 wrong settings, 128 + n: signal n."""
     options = _parser().parse_args(arguments)
     try:
-        code: int = options.run(options)
+        return stoppable(lambda: options.run(options), "finished clips")
     except SimError as error:
         print(error, file=sys.stderr)
         return 1
-    except KeyboardInterrupt:
-        print("interrupted; finished clips are kept, run the same command to resume", file=sys.stderr)
-        return 130
-    return code
 
 
 def _make(options: argparse.Namespace) -> int:

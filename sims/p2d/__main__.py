@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 from recordings import MANIFEST, read_journal, verify
@@ -16,46 +12,20 @@ from sims.p2d.generate import generate, repair
 from sims.p2d.settings import Settings
 from sims.p2d.settings_text import SettingsError, settings_from
 from sims.p2d.store import KIND, SPLITS, read_manifest
+from sims.stopping import stoppable
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs one command; returns the exit code: 0 done, 1 failed or damage, 2 wrong settings, 128 + n: signal n."""
     options = _parser().parse_args(arguments)
     try:
-        with _terminable():
-            code: int = options.run(options)
+        return stoppable(lambda: options.run(options), "finished trajectories")
     except SettingsError as error:
         print(error, file=sys.stderr)
         return 2
     except SimError as error:
         print(error, file=sys.stderr)
         return 1
-    except KeyboardInterrupt as stop:
-        what = "terminated" if isinstance(stop, _Terminated) else "interrupted"
-        print(f"{what}; finished trajectories are kept, run the same command to resume", file=sys.stderr)
-        return 143 if isinstance(stop, _Terminated) else 130
-    return code
-
-
-class _Terminated(KeyboardInterrupt):
-    """SIGTERM came."""
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """Ends the work in order on SIGTERM too, as a scheduler sends it."""
-
-    def stop(*_: object) -> None:
-        raise _Terminated
-
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, stop)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _make(options: argparse.Namespace) -> int:

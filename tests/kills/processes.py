@@ -9,6 +9,7 @@ from __future__ import annotations
 import _pyio
 import atexit
 import builtins
+import contextlib
 import errno
 import io
 import json
@@ -41,6 +42,9 @@ PATIENCE_S = 900.0
 """Seconds after which a command is taken for stuck."""
 
 POLL_S = 0.01
+
+MARK = "KILLS_COMMAND"
+"""Variable by which processes of a command are known."""
 
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir", "os.truncate", "shutil.rmtree")
 """What Python announces before it changes a folder, besides opening a file to write."""
@@ -115,11 +119,12 @@ class Running:
         Running.count += 1
         self.folder, self.moment = folder, moment
         self.log = folder.parent / f".{folder.name}_{Running.count}.log"
+        self.mark = f"{os.getpid()}_{Running.count}"
         order = {
             **{"entry": entry, "words": list(words), "folder": str(folder), "log": str(self.log)},
-            **{"variables": dict(variables or {}), "moment": moment, "writes": writes},
+            **{"variables": {**(variables or {}), MARK: self.mark}, "moment": moment, "writes": writes},
         }
-        self.process = SERVER.Process(target=_command, args=(order,))
+        self.process = SERVER.Process(target=_command, args=(order,), name=self.mark)
         self.process.start()
         self.pid = self.process.pid or 0
 
@@ -141,6 +146,10 @@ class Running:
         found = json.loads(about.read_text()) if about.exists() else {"changes": 0, "growth": 0}
         return Ended(self.process.exitcode, self.said(), Measured(used, found["changes"], found["growth"]))
 
+    def seconds(self) -> float:
+        """Processor time that it has taken so far."""
+        return _seconds(self.pid)
+
     def send(self) -> bool:
         """Sends the moment's signal."""
         assert self.moment is not None
@@ -156,15 +165,14 @@ class Running:
         return self.log.read_text(errors="replace") if self.log.exists() else ""
 
     def _others(self) -> list[psutil.Process]:
-        """Processes that still work in the command's folder."""
+        """Processes of the command that still live: those of its session, and what they have started elsewhere."""
         found = []
         for process in psutil.process_iter():
-            try:
-                if process.pid != os.getpid() and Path(process.cwd()).is_relative_to(self.folder):
+            with contextlib.suppress(psutil.Error, OSError):
+                ours = os.getsid(process.pid) == self.pid or process.environ().get(MARK) == self.mark
+                if ours and process.status() != psutil.STATUS_ZOMBIE:
                     found.append(process)
-            except (psutil.Error, OSError):
-                continue
-        return [each for each in found if each.is_running() and each.status() != psutil.STATUS_ZOMBIE]
+        return found
 
     def _settle(self) -> None:
         """Waits until workers have noticed that the command is gone."""

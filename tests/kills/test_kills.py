@@ -25,7 +25,7 @@ FAST = {"training": 3, "evaluation": 2, "prediction": 2, "sweep": 2, "training w
 
 SLOW = {
     **{"training": 8, "training with loaders": 5, "training with pictures": 6, "own videos": 8, "evaluation": 10},
-    **{"prediction": 12, "sweep": 8, "simulation": 10, "arrangement clips": 8, "arrangement": 6},
+    **{"prediction": 12, "sweep": 8, "simulation": 10, "arrangement clips": 8, "arrangement": 6, "example videos": 4},
     **{"arrangement video": 4},
     **{f"training {model}": 5 for model in works.MODELS},
 }

@@ -115,6 +115,11 @@ def arrangements(folder: Path) -> dict[str, Any]:
     return found
 
 
+def videos(folder: Path) -> dict[str, Any]:
+    """The bytes of every video."""
+    return {str(file.relative_to(folder)): file.read_bytes() for file in sorted((folder / "data").glob("[!.]*"))}
+
+
 def _without(value: Any, key: str) -> Any:
     if isinstance(value, dict):
         return {name: _without(item, key) for name, item in value.items() if name != key}
@@ -143,11 +148,16 @@ def evaluations(folder: Path) -> dict[str, Any]:
 
 
 def not_whole(folder: Path) -> list[str]:
-    """Files that are half there under their final names; names of files in the making begin with a dot."""
+    """Files that are half there under their final names; names of files in the making begin with a dot.
+
+    A recording is there when its manifest is: its arrays have their places from the start.
+    """
     found = []
     for file in sorted(folder.rglob("*")):
         inside = file.relative_to(folder).parts
         if not file.is_file() or any(part.startswith(".") for part in inside):
+            continue
+        if file.suffix == ".npy" and not (file.parent.parent / "manifest.json").exists():
             continue
         try:
             _read(file)
@@ -218,6 +228,9 @@ WORKS: dict[str, Work] = {
     "simulation": Work("sims.p2d", ("--out", "data", *SMALL_P2D), recordings, workers=True),
     "arrangement clips": Work(
         "sims.arrangement_clips", ("make", "data", "--settings", CLIPS, "--workers", "1"), recordings, workers=True
+    ),
+    "example videos": Work(
+        "sims.example_videos", ("--out", "data", "--videos", "3", "--frames", "3", "--size", "64"), videos
     ),
     "arrangement": Work(
         "apex_lab.arrange",
