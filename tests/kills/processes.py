@@ -23,6 +23,7 @@ import stat
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,12 +32,10 @@ from typing import Any
 import psutil
 
 SERVER = multiprocessing.get_context("forkserver")
-SERVER.set_forkserver_preload(
-    [
-        *("tests.kills.processes", "tests.tiny", "apex_lab.train", "apex_lab.evaluate", "apex_lab.predict"),
-        *("apex_lab.training.fit", "apex_lab.data.p2d", "apex_lab.view", "apex_lab.models.apex", "sims.p2d.__main__"),
-    ]
-)
+PRELOADED = [
+    *("tests.kills.processes", "tests.tiny", "apex_lab.train", "apex_lab.evaluate", "apex_lab.predict"),
+    *("apex_lab.training.fit", "apex_lab.data.p2d", "apex_lab.view", "apex_lab.models.apex", "sims.p2d.__main__"),
+]
 
 PATIENCE_S = 900.0
 """Seconds after which a command is taken for stuck."""
@@ -124,6 +123,7 @@ class Running:
             **{"entry": entry, "words": list(words), "folder": str(folder), "log": str(self.log)},
             **{"variables": {**(variables or {}), MARK: self.mark}, "moment": moment, "writes": writes},
         }
+        SERVER.set_forkserver_preload(PRELOADED)  # not in the commands, whose loaders have servers of their own
         self.process = SERVER.Process(target=_command, args=(order,), name=self.mark)
         self.process.start()
         self.pid = self.process.pid or 0
@@ -212,6 +212,7 @@ def _command(order: dict[str, Any]) -> None:
         _fill_up(Path(order["folder"]), order["writes"], runs)
     before = _address_space()
     _limit(order["moment"], before)
+    warnings.filterwarnings("ignore", message=".*found in sys.modules after import.*")  # the server's
     sys.argv = [order["entry"], *order["words"]]
     code: Any = 0
     try:

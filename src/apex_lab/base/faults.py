@@ -46,8 +46,10 @@ def told(error: BaseException, where: str = "") -> str:
         error: the exception.
         where: the key or file at hand.
     """
-    if isinstance(error, OSError) and is_full(error) and error.filename is not None:
-        return str(unwritable(Path(os.fsdecode(error.filename)), error))
+    if isinstance(error, OSError) and is_full(error):
+        # the system names no file when a write to an open one fails; most lie below the folder at hand
+        named = error.filename if error.filename is not None else os.path.join(_folder(), "...")
+        return str(unwritable(Path(os.fsdecode(named)), error))
     return f"{where}{': ' if where else ''}{cited(error)} ({_stored(error)})."
 
 

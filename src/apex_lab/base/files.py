@@ -134,6 +134,22 @@ def unwritable(path: Path, error: OSError) -> UserError:
     return UserError(f"{path} cannot be written ({error.strerror or error}): choose another folder or its permissions.")
 
 
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Inside, a file or a folder of files is written by others; their errors get its name.
+
+    Raises:
+        UserError: the disk is full, or a file there cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        named = error.filename is not None and str(path.absolute().parent) in os.fsdecode(error.filename)
+        if is_full(error) or named:
+            raise unwritable(path, error) from error
+        raise
+
+
 def free_space(path: Path) -> str:
     """How much is free where a file is or would be, in words."""
     there = next((folder for folder in (path, *path.absolute().parents) if folder.exists()), Path())
