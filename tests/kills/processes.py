@@ -301,7 +301,8 @@ def drawn(draw: random.Random, whole: Measured, signals: Sequence[int | None], a
     signum = draw.choice(list(signals))
     by_itself = alone and draw.random() < 0.5
     if signum is None:
-        return Moment(None, growth=draw.randrange(1, max(2, whole.growth)))
+        # most of the growth is room that is reserved and never used, so small limits are the ones that matter
+        return Moment(None, growth=1 + int(whole.growth * draw.random() ** 4))
     if whole.changes > 1 and draw.random() < 0.4:
         return Moment(signum, change=draw.randrange(1, whole.changes + 1), alone=by_itself)
     return Moment(signum, seconds=draw.uniform(0.0, whole.seconds), alone=by_itself)
