@@ -61,7 +61,7 @@ def test_a_full_disk_is_told_with_its_free_space(tmp_path: Path) -> None:
         sentence = str(unwritable(tmp_path / "no" / "file", error))
         assert re.match(rf"No space left for {re.escape(str(tmp_path))}/no/file {free}: free some and run", sentence)
     assert "(Disk quota exceeded; " in str(unwritable(tmp_path, OSError(errno.EDQUOT, "")))
-    with pytest.raises(UserError, match="No space left for .*/file"), writing(tmp_path / "file"):
+    with pytest.raises(UserError, match=r"No space left for .*/file"), writing(tmp_path / "file"):
         raise OSError(errno.ENOSPC, "No space left on device")
     with pytest.raises(OSError, match="elsewhere"), writing(tmp_path / "file"):
         raise OSError(errno.EIO, "elsewhere")
