@@ -7,7 +7,6 @@ python -m apex_lab.predict checkpoint=apex-p2d-cpu video=0     a camera, until C
 
 from __future__ import annotations
 
-import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +15,10 @@ from typing import Any, Literal
 from filelock import FileLock, Timeout
 from pydantic import BaseModel, ConfigDict, Field
 
-from apex_lab.base import console, interrupts
+from apex_lab.base import console, faults, interrupts
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import make_folder, unwritable
-from apex_lab.base.validation import one_line, sentence, validate
+from apex_lab.base.validation import validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import schema as config
 from apex_lab.prediction.load import digest_of, one_file, segmenter_of
@@ -137,9 +136,8 @@ def predict(job: Prediction) -> None:
                 )
             except UserError as error:
                 failed[source] = str(error)
-            except Exception as error:  # noqa: BLE001 - reported here and below; the others must still be done
-                traceback.print_exc()
-                failed[source] = sentence(f"{source}: {type(error).__name__}: {one_line(error)}")
+            except Exception as error:  # noqa: BLE001 - reported below; the others must still be done
+                failed[source] = faults.told(error, str(source))
             if source in failed and len(job.videos) > 1:
                 console.error(failed[source])
     if failed:

@@ -50,7 +50,7 @@ def told(error: BaseException, where: str = "") -> str:
         # the system names no file when a write to an open one fails; most lie below the folder at hand
         named = error.filename if error.filename is not None else os.path.join(_folder(), "...")
         return str(unwritable(Path(os.fsdecode(named)), error))
-    return f"{where}{': ' if where else ''}{cited(error)} ({_stored(error)})."
+    return f"{where}{': ' if where else ''}{cited(error)} ({stored(''.join(traceback.format_exception(error)))})."
 
 
 def cited(error: BaseException) -> str:
@@ -69,13 +69,13 @@ def _short(text: str, longest: int) -> str:
     return text if len(text) <= longest else f"{text[:half]} ... {text[-half:]}"
 
 
-def _stored(error: BaseException) -> str:
-    """Writes the traceback into a file of its own among the temporary ones; what the sentence says of it."""
+def stored(trace: str) -> str:
+    """Writes a traceback into a file of its own among the temporary ones; what a sentence says of it."""
     lines = [
         f"{time.strftime('%Y-%m-%d %H:%M:%S')}  apex_lab {apex_lab.__version__}, Python {sys.version.split()[0]}",
         f"in {_folder()}: {shlex.join(sys.argv)}",
         "",
-        *traceback.format_exception(error),
+        trace,
     ]
     try:
         handle, name = tempfile.mkstemp(prefix=time.strftime("apex_lab_%Y%m%d_%H%M%S_"), suffix=".log")

@@ -114,8 +114,8 @@ def make_folder(path: Path) -> Path:
     return path
 
 
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""What a system says of a disk, a share of it or a file that may not grow."""
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What a system says of a full disk, or of a user's full share of it."""
 
 
 def is_full(error: OSError) -> bool:
