@@ -21,7 +21,7 @@ def stoppable(work: Callable[[], int], kept: str) -> int:
         kept: what of it stays, such as "finished trajectories".
 
     Returns:
-        The exit code; 130 after Ctrl-C, 143 after SIGTERM.
+        The exit code; 130 after Ctrl-C, 143 after SIGTERM, 1 when memory has run out.
     """
     try:
         with _terminable():
@@ -31,6 +31,16 @@ def stoppable(work: Callable[[], int], kept: str) -> int:
         what = "terminated" if by_signal else "interrupted"
         print(f"{what}; {kept} are kept, run the same command to resume", file=sys.stderr)
         return 143 if by_signal else 130
+    except (MemoryError, RuntimeError) as error:
+        if not _no_memory(error):
+            raise
+        print(f"out of memory ({error}); {kept} are kept, run the same command to resume", file=sys.stderr)
+        return 1
+
+
+def _no_memory(error: Exception) -> bool:
+    """Whether memory ran out; threads that cannot be started lack it too."""
+    return isinstance(error, MemoryError) or "can't start new thread" in str(error)
 
 
 @contextmanager

@@ -40,7 +40,7 @@ def unbroken(
         if name not in found:
             folder = tmp_path_factory.mktemp("unbroken")
             words = [word.replace("{inputs}", str(inputs)) for word in WORKS[name].words]
-            ended = Running(WORKS[name].entry, words, folder, variables=WORKS[name].variables).end()
+            ended = Running(WORKS[name].entry, words, folder, variables=WORKS[name].variables).end(WORKS[name].workers)
             assert ended.code == 0, ended.said
             found[name] = WORKS[name].results(folder), ended.measured
             assert found[name][0]

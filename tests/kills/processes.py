@@ -11,6 +11,7 @@ import atexit
 import builtins
 import contextlib
 import errno
+import faulthandler
 import importlib
 import io
 import json
@@ -38,10 +39,10 @@ PRELOADED = [
     *("apex_lab.training.fit", "apex_lab.data.p2d", "apex_lab.view", "apex_lab.models.apex", "sims.p2d.__main__"),
 ]
 
-PATIENCE_S = 900.0
+PATIENCE_S = 600.0
 """Seconds after which a command is taken for stuck."""
 
-POLL_S = 0.01
+POLL_S = 0.015
 
 MARK = "KILLS_COMMAND"
 """Variable by which processes of a command are known."""
@@ -124,19 +125,24 @@ class Running:
             **{"entry": entry, "words": list(words), "folder": str(folder), "log": str(self.log)},
             **{"variables": {**(variables or {}), MARK: self.mark}, "moment": moment, "writes": writes},
         }
+        os.environ.setdefault("JE_ARROW_MALLOC_CONF", "background_thread:false")  # a fork takes no thread along
         SERVER.set_forkserver_preload(PRELOADED)  # not in the commands, whose loaders have servers of their own
         self.process = SERVER.Process(target=_command, args=(order,), name=self.mark)
         self.process.start()
         self.pid = self.process.pid or 0
 
-    def end(self) -> Ended:
-        """Waits for the end, sending the signal when it is due; nothing of the command is left running then."""
+    def end(self, children: bool = True) -> Ended:
+        """Waits for the end, sending the signal when it is due; nothing of the command is left running then.
+
+        Args:
+            children: whether it has any whose processor time counts too, which is costly to look at.
+        """
         began, used, sent = time.monotonic(), 0.0, False
         due = self.moment.seconds if self.moment is not None else None
         while self.process.exitcode is None:
             self.process.join(POLL_S)
             if due is not None or self.moment is None:
-                used = max(used, _seconds(self.pid))
+                used = max(used, _seconds(self.pid, children))
             if due is not None and not sent and used >= due:
                 sent = self.send()
             if time.monotonic() - began > PATIENCE_S:
@@ -189,11 +195,11 @@ class Running:
             process.kill()
 
 
-def _seconds(pid: int) -> float:
-    """Processor time of a process and its children so far."""
+def _seconds(pid: int, children: bool = True) -> float:
+    """Processor time of a process, and its children, so far."""
     try:
         root = psutil.Process(pid)
-        return sum(sum(each.cpu_times()[:4]) for each in (root, *root.children()))
+        return sum(sum(each.cpu_times()[:4]) for each in (root, *(root.children() if children else ())))
     except (psutil.Error, OSError):
         return 0.0
 
@@ -215,6 +221,7 @@ def _command(order: dict[str, Any]) -> None:
         _fill_up(Path(order["folder"]), order["writes"], runs)
     before = _address_space()
     _limit(order["moment"], before)
+    faulthandler.dump_traceback_later(PATIENCE_S - 60, file=sys.__stderr__ or 2)  # where it is stuck
     warnings.filterwarnings("ignore", message=".*found in sys.modules after import.*")  # the server's
     sys.argv = [order["entry"], *order["words"]]
     code: Any = 0
@@ -228,6 +235,7 @@ def _command(order: dict[str, Any]) -> None:
     finally:
         atexit._run_exitfuncs()  # which multiprocessing does not
         runs[0] = False
+        faulthandler.cancel_dump_traceback_later()
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         about = {"changes": counted[0], "growth": _address_space("VmPeak") - before}
         Path(order["log"]).with_suffix(".json").write_text(json.dumps(about))

@@ -42,9 +42,7 @@ def broken_at_5(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-@pytest.mark.parametrize(
-    "model", ["tiny", "apex", *(pytest.param(model, marks=pytest.mark.slow) for model in MODELS if model != "apex")]
-)
+@pytest.mark.parametrize("model", ["tiny", *(pytest.param(model, marks=pytest.mark.slow) for model in MODELS)])
 def test_training_stops_at_the_step_with_term_and_batch(
     model: str,
     broken_at_5: list[str],

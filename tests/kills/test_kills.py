@@ -20,11 +20,11 @@ SEED = os.environ.get("KILLS_SEED", "0")
 
 EVERY = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, None)
 
-FAST = {"training": 3, "evaluation": 2, "prediction": 2, "sweep": 2, "training with pictures": 1}
+FAST = {"training": 4, "evaluation": 3, "prediction": 3}
 """Kills of the default suite; docs/reliability.md counts them."""
 
 SLOW = {
-    **{"training": 8, "training with loaders": 5, "training with pictures": 6, "own videos": 8, "evaluation": 10},
+    **{"training": 8, "training with loaders": 3, "training with pictures": 6, "own videos": 8, "evaluation": 10},
     **{"prediction": 12, "sweep": 8, "simulation": 10, "arrangement clips": 8, "arrangement": 6, "example videos": 4},
     **{"arrangement video": 4},
     **{f"training {model}": 5 for model in works.MODELS},
@@ -55,7 +55,7 @@ def kill(name: str, kills: int, folder: Path, inputs: Path, whole: tuple[dict[st
     while tally.count < kills:
         assert len(tally.moments) < 6 * kills + 10, f"{tally} {tally.moments}"
         moment = drawn(draw, measured, EVERY, work.workers)
-        ended = started(work, place, inputs, moment).end()
+        ended = started(work, place, inputs, moment).end(work.workers)
         told = f"{name}, {tally}, {tally.moments}, {moment}"
         if tally.add(moment, ended):
             check(place, moment, ended, told)

@@ -141,7 +141,9 @@ def evaluations(folder: Path) -> dict[str, Any]:
         if "/." in name:
             continue
         if file.name == "metrics.json":
-            found[name] = json.loads(file.read_text())["splits"]
+            splits = json.loads(file.read_text())["splits"]
+            # the name of the evaluation holds the commit, which whoever works on the code may change meanwhile
+            found[name] = {split: {k: v for k, v in of.items() if k != "evaluation"} for split, of in splits.items()}
         elif file.suffix in (".csv", ".npz"):
             found[name] = file.read_bytes()
     return found
@@ -224,7 +226,9 @@ WORKS: dict[str, Work] = {
         ),
         predictions,
     ),
-    "sweep": Work(TRAIN, (*TINY, *STEPS, "seed=0,1", "-m"), runs),
+    "sweep": Work(
+        TRAIN, (*TINY, *STEPS, "seed=0,1", "hydra.sweeper.retry_failed=true", "-m"), runs
+    ),  # want of memory is a failure of its job
     "simulation": Work("sims.p2d", ("--out", "data", *SMALL_P2D), recordings, workers=True),
     "arrangement clips": Work(
         "sims.arrangement_clips", ("make", "data", "--settings", CLIPS, "--workers", "1"), recordings, workers=True
