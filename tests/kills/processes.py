@@ -125,7 +125,7 @@ class Running:
             **{"entry": entry, "words": list(words), "folder": str(folder), "log": str(self.log)},
             **{"variables": {**(variables or {}), MARK: self.mark}, "moment": moment, "writes": writes},
         }
-        os.environ.setdefault("JE_ARROW_MALLOC_CONF", "background_thread:false")  # a fork takes no thread along
+        os.environ.setdefault("JE_ARROW_MALLOC_CONF", "background_thread:false")  # of Arrow; a fork would lose it
         SERVER.set_forkserver_preload(PRELOADED)  # not in the commands, whose loaders have servers of their own
         self.process = SERVER.Process(target=_command, args=(order,), name=self.mark)
         self.process.start()
