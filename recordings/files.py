@@ -125,10 +125,16 @@ def no_room(error: OSError, path: Path | str) -> RecordingError:
     """The error for a failed write."""
     full = error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
     remedy = "free space on that disk" if full else "check that disk"
+    room = f"; {_free(Path(path))} free there" if full else ""
     return RecordingError(
-        f"writing {path} failed ({os.strerror(error.errno or 0)}): {remedy} and run the same command again; "
+        f"writing {path} failed ({os.strerror(error.errno or 0)}{room}): {remedy} and run the same command again; "
         "all that is finished is kept"
     )
+
+
+def _free(path: Path) -> str:
+    there = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    return _size(shutil.disk_usage(there).free)
 
 
 def write_at_once(path: Path, text: str) -> None:

@@ -45,8 +45,13 @@ def ending(work: Callable[[], int], kept: str) -> int:
         say(f"{'terminated' if terminated else 'interrupted'}; {kept}", error=True)
         return 128 + (signal.SIGTERM if terminated else signal.SIGINT)
     except Exception as error:  # noqa: BLE001 - what nobody foresaw
-        say(told(error), error=True)
+        say(f"out of memory ({error}); {kept}" if _no_memory(error) else told(error), error=True)
         return 1
+
+
+def _no_memory(error: Exception) -> bool:
+    """Whether memory ran out; threads that cannot be started lack it too."""
+    return isinstance(error, MemoryError) or "can't start new thread" in str(error)
 
 
 def positive(text: str) -> int:

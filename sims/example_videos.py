@@ -7,6 +7,7 @@ The files look like those of a still camera: 4 : 3, 15 frames a second, compress
 from __future__ import annotations
 
 import argparse
+import shutil
 import sys
 from pathlib import Path
 
@@ -96,7 +97,7 @@ def write_video(path: Path, video: np.ndarray) -> None:
     """Writes (T, H, W, 3) uint8 RGB as MPEG-4.
 
     Raises:
-        SimError: OpenCV cannot write there.
+        SimError: OpenCV cannot write there, or not all of it.
     """
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_S, video.shape[2:0:-1])
     if not writer.isOpened():
@@ -104,6 +105,21 @@ def write_video(path: Path, video: np.ndarray) -> None:
     for frame in video:
         writer.write(np.ascontiguousarray(frame[..., ::-1]))
     writer.release()
+    if (count := _frames_in(path)) != len(video):  # OpenCV says nothing of a full disk
+        path.unlink(missing_ok=True)
+        free = shutil.disk_usage(path.parent).free / 1e6
+        raise SimError(
+            f"{path} cannot be written ({count} of {len(video)} frames arrived; {free:.1f} MB free there): "
+            "free some space and run the same command again"
+        )
+
+
+def _frames_in(path: Path) -> int:
+    reader, count = cv2.VideoCapture(str(path)), 0
+    while reader.read()[0]:
+        count += 1
+    reader.release()
+    return count
 
 
 if __name__ == "__main__":

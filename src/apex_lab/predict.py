@@ -137,7 +137,7 @@ def predict(job: Prediction) -> None:
                 )
             except UserError as error:
                 failed[source] = str(error)
-            except Exception as error:  # noqa: BLE001 - reported here and below; the others must still be done
+            except Exception as error:  # noqa: BLE001 - reported below; the others must still be done
                 failed[source] = faults.told(error, str(source))
             if source in failed and len(job.videos) > 1:
                 console.error(failed[source])

@@ -1,13 +1,15 @@
 from __future__ import annotations
 
+import errno
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import make_folder, read_json, replacing, write_json, write_text
+from apex_lab.base.files import make_folder, read_json, replacing, unwritable, write_json, write_text, writing
 
 
 def test_a_file_changes_only_when_it_is_whole(tmp_path: Path) -> None:
@@ -48,3 +50,18 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
         make_folder(tmp_path / "file" / "inside")
     with pytest.raises(UserError, match=r"missing/note\.txt cannot be written"):
         write_text(tmp_path / "missing" / "note.txt", "")
+
+
+def test_a_full_disk_is_told_with_its_free_space(tmp_path: Path) -> None:
+    free = r"\(\d+(\.\d)? (GB|MB|kB|bytes) free there\)"
+    for error in (
+        OSError(errno.ENOSPC, "No space left on device"),
+        OSError("ffmpeg: av_write: No space left on device"),
+    ):
+        sentence = str(unwritable(tmp_path / "no" / "file", error))
+        assert re.match(rf"No space left for {re.escape(str(tmp_path))}/no/file {free}: free some and run", sentence)
+    assert "(Disk quota exceeded; " in str(unwritable(tmp_path, OSError(errno.EDQUOT, "")))
+    with pytest.raises(UserError, match=r"No space left for .*/file"), writing(tmp_path / "file"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    with pytest.raises(OSError, match="elsewhere"), writing(tmp_path / "file"):
+        raise OSError(errno.EIO, "elsewhere")

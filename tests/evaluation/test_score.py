@@ -130,6 +130,27 @@ def test_damaged_parts_are_told(tmp_path: Path) -> None:
     assert not (tmp_path / "parts").exists()
 
 
+def test_parts_whose_removal_was_killed_are_the_first_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = Parts(tmp_path / "parts", 1)
+    for number in range(3):
+        parts.save([Predicted(str(number), number, np.zeros((1, 2, 2), np.int64), frozenset(), 0.5, 0.0)])
+    unlink, removed = Path.unlink, []
+
+    def killed(path: Path, missing_ok: bool = False) -> None:
+        if removed:
+            raise KeyboardInterrupt
+        removed.append(path.name)
+        unlink(path, missing_ok)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", killed)
+        with pytest.raises(KeyboardInterrupt):
+            parts.remove()
+    assert [one.position for one in parts] == [0, 1]
+    parts.remove()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_videos_are_ranked() -> None:
     rows = [{"video": f"v{i}", "ari": value, "fps": 10 * value} for i, value in enumerate((0.5, 0.1, 0.9, 0.7, 0.3))]
     rows.append({"video": "undefined", "ari": math.nan, "fps": math.nan})

@@ -13,9 +13,9 @@ from filelock import FileLock, Timeout
 from apex_lab.arrangement.pool import Pool
 from apex_lab.arrangement.results import Outcome, Store, identity, summary, table, write
 from apex_lab.arrangement.task import Failure, Setting, Task
-from apex_lab.base import console
+from apex_lab.base import console, faults
 from apex_lab.base.errors import Busy, UserError
-from apex_lab.base.files import make_folder
+from apex_lab.base.files import make_folder, unwritable
 from apex_lab.base.progress import Meter
 from apex_lab.base.validation import one_line, sentence
 from apex_lab.runs import provenance
@@ -134,9 +134,7 @@ def _outcomes(asked: Benchmark, left: Sequence[Task], done: int) -> Iterator[tup
                 continue
             if answer.final:
                 raise UserError(answer.reason)
-            if answer.details:
-                console.error(answer.details)
-            failed[task] = answer.reason
+            failed[task] = f"{answer.reason} ({faults.stored(answer.details)})" if answer.details else answer.reason
             if len(failed) == MAX_FAILURES:
                 break
     if failed:
@@ -157,7 +155,7 @@ def _locked(folder: Path) -> Iterator[None]:
     except Timeout as error:
         raise Busy(f"{folder} is being worked on by another process: wait for it or stop it.") from error
     except OSError as error:
-        raise UserError(f"{folder} cannot be written ({error.strerror}): give another folder=.") from error
+        raise unwritable(folder, error) from error
     try:
         yield
     finally:

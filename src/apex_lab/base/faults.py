@@ -14,6 +14,7 @@ from pathlib import Path
 
 import apex_lab
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import is_full, unwritable
 from apex_lab.base.validation import one_line, short
 
 LONGEST = 400
@@ -45,7 +46,11 @@ def told(error: BaseException, where: str = "") -> str:
         error: the exception.
         where: the key or file at hand.
     """
-    return f"{where}{': ' if where else ''}{cited(error)} ({_stored(error)})."
+    if isinstance(error, OSError) and is_full(error):
+        # the system names no file when a write to an open one fails; most lie below the folder at hand
+        named = error.filename if error.filename is not None else os.path.join(_folder(), "...")
+        return str(unwritable(Path(os.fsdecode(named)), error))
+    return f"{where}{': ' if where else ''}{cited(error)} ({stored(''.join(traceback.format_exception(error)))})."
 
 
 def cited(error: BaseException) -> str:
@@ -59,13 +64,13 @@ def cited(error: BaseException) -> str:
     return short(text, LONGEST).rstrip(".")
 
 
-def _stored(error: BaseException) -> str:
-    """Writes the traceback into a file of its own among the temporary ones; what the sentence says of it."""
+def stored(trace: str) -> str:
+    """Writes a traceback into a file of its own among the temporary ones; what a sentence says of it."""
     lines = [
         f"{time.strftime('%Y-%m-%d %H:%M:%S')}  apex_lab {apex_lab.__version__}, Python {sys.version.split()[0]}",
         f"in {_folder()}: {shlex.join(sys.argv)}",
         "",
-        *traceback.format_exception(error),
+        trace,
     ]
     try:
         handle, name = tempfile.mkstemp(prefix=time.strftime("apex_lab_%Y%m%d_%H%M%S_"), suffix=".log")

@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import IO, Any
@@ -137,14 +138,58 @@ def make_folder(path: Path) -> Path:
     return path
 
 
+FULL = (errno.ENOSPC, errno.EDQUOT)
+"""What a system says of a full disk, or of a user's full share of it."""
+
+
+def is_full(error: OSError) -> bool:
+    """Whether there is no room; other programs say so in words alone."""
+    return error.errno in FULL or os.strerror(errno.ENOSPC) in str(error)
+
+
 def unwritable(path: Path, error: OSError) -> UserError:
     """The sentence for a file that could not be written."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+    if is_full(error):
+        cause = "" if error.errno in (errno.ENOSPC, None) else f"{os.strerror(error.errno)}; "
         return UserError(
-            f"No space left for {path}: free some and run the same command again; nothing stored was lost."
+            f"No space left for {path} ({cause}{free_space(path)}): free some and run the same command again; "
+            "nothing stored was lost."
         )
     why = error.strerror or one_line(error)
     return UserError(f"{short(str(path))} cannot be written ({why}): choose another folder or its permissions.")
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Inside, a file or a folder of files is written by others; their errors get its name.
+
+    Raises:
+        UserError: the disk is full, or a file there cannot be written.
+    """
+    try:
+        yield
+    except OSError as error:
+        named = error.filename is not None and str(path.absolute().parent) in os.fsdecode(error.filename)
+        if is_full(error) or named:
+            raise unwritable(path, error) from error
+        raise
+
+
+def free_space(path: Path) -> str:
+    """How much is free where a file is or would be, in words."""
+    there = next((folder for folder in (path, *path.absolute().parents) if folder.exists()), Path())
+    try:
+        return f"{readable_size(shutil.disk_usage(there).free)} free there"
+    except OSError as error:
+        return f"what is free there cannot be told: {error.strerror}"
+
+
+def readable_size(count: int) -> str:
+    """Bytes in the unit a person would use."""
+    for size, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count} bytes"
 
 
 def _sync_folder(folder: Path) -> None:

@@ -17,6 +17,7 @@ from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, sentence, to_open
 from apex_lab.config.composition import CHOICES, Composed, composed, composing, full_names, not_there, told
@@ -25,6 +26,9 @@ from apex_lab.config.options import at_home, options
 
 Check = Callable[[dict[str, Any], dict[str, str], Sequence[str]], Any]
 """(plain configuration, group -> word, overrides) -> a checked job; raises UserError."""
+
+MANY = 200
+"""Jobs from which on looking for their runs takes seconds, so that it is announced."""
 
 
 def listed(overrides: Sequence[str], config_dir: str | None = None) -> list[Composed]:
@@ -44,6 +48,8 @@ def listed(overrides: Sequence[str], config_dir: str | None = None) -> list[Comp
         check_hydra_keys("train", extra, overrides)
         check_groups("train", overrides)
         jobs = expand([*swept_by_files("train", extra, overrides), *overrides], extra)
+        if len(jobs) >= MANY:
+            console.put(f"{len(jobs)} jobs: looking for their runs\n", error=True)
         return list(composed_jobs(check_training, "train", extra, jobs))
 
 

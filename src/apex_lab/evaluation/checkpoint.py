@@ -16,7 +16,7 @@ from filelock import FileLock, Timeout
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import make_folder, read_json
+from apex_lab.base.files import make_folder, read_json, unwritable
 from apex_lab.base.validation import one_line, sentence
 from apex_lab.config import components
 from apex_lab.config import schema as config
@@ -121,7 +121,7 @@ def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
     except Timeout as error:
         raise UserError(f"{folder} is being worked on by another process: wait for it or stop it.") from error
     except OSError as error:
-        raise UserError(f"{folder} cannot be written ({error.strerror}): give another folder=.") from error
+        raise unwritable(folder, error) from error
     with lock:
         _evaluate(request, file, content, job, model, digest, folder)
 
@@ -145,6 +145,7 @@ def _evaluate(
     view = folder / "view" / request.split
     done = None if request.again else _done(folder, request, key)
     if done is not None:
+        _parts(request, folder, key).remove()  # a kill may have come between the results and this
         console.say(f"evaluated already (again=true does it once more): {folder / 'metrics.json'}")
         pictures = sorted(view.glob("*"), key=_film_strip_first) if done.get("pictures") else []
         exported = [export_path(folder, request.split, request.export)] if request.export is not None else []

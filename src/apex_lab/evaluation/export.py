@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Literal
 
-from apex_lab.base.files import drafts
+from apex_lab.base.files import drafts, writing
 from apex_lab.data.video_set import VideoSet
 from apex_lab.evaluation.partial import Predicted
 from apex_lab.formats import PredictedVideo, open_writer
@@ -45,13 +45,16 @@ def write(
 
     Returns:
         The paths, predictions first.
+
+    Raises:
+        UserError: the disk is full or the folder cannot be written; nothing new stands under its name then.
     """
     paths = []
     for truth in (False,) if format == "npz" or not videos.labelled else (False, True):
         path = export_path(folder, split, format, truth)
         for draft in (*drafts(path.parent, path.name), *drafts(path), *(d for f in path.glob("*/") for d in drafts(f))):
             draft.unlink()  # left by a kill in the middle of writing
-        with open_writer(format, path, truth, ignore_label) as writer:
+        with writing(path), open_writer(format, path, truth, ignore_label) as writer:
             for each in predictions:
                 labels = videos[each.position]["segmentation"].numpy() if videos.labelled else None
                 about = videos.metadata(each.position)

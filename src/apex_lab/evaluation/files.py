@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence, validate
 from apex_lab.config import components, limits
@@ -14,6 +15,9 @@ from apex_lab.config import schema as config
 from apex_lab.evaluation.other_data import OtherData
 from apex_lab.runs import checkpoints
 from apex_lab.runs.checkpoint_files import Bad, find
+
+MANY = 100
+"""Checkpoints from which on a look into all of them takes seconds, so that it is announced."""
 
 __all__ = ["Bad", "find", "here", "listed", "look", "of_another_version"]
 
@@ -43,6 +47,8 @@ def look(
     """
     good: list[Path] = []
     bad: Bad = {}
+    if len(files) - _glance.cache_info().currsize >= MANY:
+        console.put(f"{len(files)} checkpoints: looking into each\n", error=True)
     for file in files:
         try:
             content = _glance(file, trusted, _stamp(file))

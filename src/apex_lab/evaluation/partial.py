@@ -109,13 +109,15 @@ class Parts:
             file.write(buffer.getvalue())
 
     def remove(self) -> None:
-        """Removes all parts, because the evaluation is over or starts again; a folder that is not ours stays."""
-        if not self._marked():
-            return
-        for path in [*self._files(), *drafts(self.folder)]:
-            path.unlink()
-        (self.folder / MARKER).unlink()
-        with contextlib.suppress(OSError):  # somebody put a file there
+        """Removes all parts, because the evaluation is over or starts again; a folder that is not ours stays.
+
+        The last part goes first, so that a kill on the way leaves the first ones, from which one can resume.
+        """
+        if self._marked():
+            for path in [*drafts(self.folder), *reversed(self._files())]:
+                path.unlink()
+            (self.folder / MARKER).unlink()
+        with contextlib.suppress(OSError):  # not there, or somebody put a file there
             self.folder.rmdir()
 
     def _marked(self) -> bool:

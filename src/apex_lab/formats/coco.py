@@ -13,7 +13,6 @@ the reader makes one segment of all pixels without a mask.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +22,7 @@ import numpy as np
 from jaxtyping import Int64, Integer
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import draft_of
+from apex_lab.base.files import make_folder, write_text
 from apex_lab.formats.bounds import check_integer, check_shape
 from apex_lab.formats.rle import UNPAINTED, encode, paint
 from apex_lab.formats.video import PredictedVideo, labels_of, with_rest
@@ -86,8 +85,7 @@ class CocoWriter:
     ) -> None:
         if kind is not None:
             return
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        draft = draft_of(self.path)
+        make_folder(self.path.parent)
         page = {
             "info": {"description": "ground truth, written by apex_lab"},
             "licenses": [],
@@ -96,8 +94,7 @@ class CocoWriter:
             "images": self._images,
             "annotations": self._masks,
         }
-        draft.write_text(json.dumps(page if self.truth else self._masks) + "\n", encoding="utf-8")
-        os.replace(draft, self.path)
+        write_text(self.path, json.dumps(page if self.truth else self._masks) + "\n")
 
 
 def read_results(

@@ -20,14 +20,13 @@ Beside ground truth lie `V/seqinfo.ini` (length and size of V) and `seqmaps/all.
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 from jaxtyping import Float64, Integer
 
-from apex_lab.base.files import draft_of
+from apex_lab.base.files import write_text
 from apex_lab.formats.davis import plain_name
 from apex_lab.formats.rle import encode
 from apex_lab.formats.video import PredictedVideo, labels_of
@@ -131,6 +130,4 @@ def _visibility(objects: ObjectMetadata | None, frames: int) -> dict[int, Float6
 
 
 def _write(file: Path, lines: list[str]) -> None:
-    draft = draft_of(file)
-    draft.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
-    os.replace(draft, file)
+    write_text(file, "".join(f"{line}\n" for line in lines))

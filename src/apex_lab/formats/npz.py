@@ -205,11 +205,12 @@ class NpzWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._archive.close()
-        if kind is None:
-            os.replace(self._draft, self.path)
-        else:
-            self._draft.unlink()
+        try:
+            self._archive.close()
+            if kind is None:
+                os.replace(self._draft, self.path)
+        finally:
+            self._draft.unlink(missing_ok=True)
 
 
 def one_hot(identities: Integer[np.ndarray, "T H W"]) -> tuple[np.ndarray, Int64[np.ndarray, "T K"]]:

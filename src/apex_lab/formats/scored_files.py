@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from jaxtyping import Int64, Integer
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import draft_of
+from apex_lab.base.files import make_folder, write_text
 from apex_lab.formats.bounds import GIGABYTES, at_most
 from apex_lab.formats.coco import CocoTruth, Places, read_results, videos_with_results
 from apex_lab.formats.davis import frame_files, read_davis, video_names
@@ -147,10 +146,8 @@ def guess_format(path: Path) -> Format:
 def write_result(result: dict[str, Any], path: str | Path) -> None:
     """Writes a result as JSON, at once; tables as lists of rows, undefined values as null."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = draft_of(path)
-    draft.write_text(json.dumps(plain(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(draft, path)
+    make_folder(path.parent)
+    write_text(path, json.dumps(plain(result), indent=1, allow_nan=False) + "\n")
 
 
 def plain(value: Any) -> Any:

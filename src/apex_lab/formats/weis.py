@@ -81,12 +81,13 @@ class WeisWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._file.write("[]" if self._separator == "[" else "]\n")
-        self._file.close()
-        if kind is None:
-            os.replace(self._draft, self.path)
-        else:
-            self._draft.unlink()
+        try:
+            with self._file:
+                self._file.write("[]" if self._separator == "[" else "]\n")
+            if kind is None:
+                os.replace(self._draft, self.path)
+        finally:
+            self._draft.unlink(missing_ok=True)
 
 
 def read_weis(

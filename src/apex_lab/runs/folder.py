@@ -87,9 +87,7 @@ class Run:
         except Timeout as error:
             raise Busy(f"{self.folder} is being worked on by another process: wait for it or stop it.") from error
         except OSError as error:
-            raise UserError(
-                f"{self.folder} cannot be written ({error.strerror}): choose another paths.outputs."
-            ) from error
+            raise unwritable(self.folder, error) from error
         if self.record_file.is_file():
             self._read()
         return self

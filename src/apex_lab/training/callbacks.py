@@ -17,7 +17,7 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.progress import Meter
 from apex_lab.runs import checkpoints
 from apex_lab.runs.folder import Run
-from apex_lab.training.learner import Learner
+from apex_lab.training.learner import Diverged, Learner
 
 
 class Checkpoints(L.Callback):
@@ -89,16 +89,28 @@ class Checkpoints(L.Callback):
         return interval is not None and (step % interval == 0 or _ended(trainer, step, self._max_steps))
 
     def _content(self, learner: Learner) -> dict[str, Any]:
+        """What every checkpoint holds.
+
+        Raises:
+            Diverged: weights are not finite; such are never stored.
+        """
         job = self._run.job
+        inference = checkpoints.inference_part(job.config, learner.update.model, learner.step)
+        sick = [name for name, weight in inference["weights"].items() if not torch.isfinite(weight).all()]
+        if sick:  # the loss will tell at the next step, which is too late for the checkpoint
+            raise Diverged(
+                f"Weights are not finite after step {learner.step} (not finite: {sick[0]}): "
+                "try a lower optimizer.lr, a lower trainer.gradient_clip_norm or another seed."
+            )
         return {
             "step": learner.step,
-            "inference": checkpoints.inference_part(job.config, learner.update.model, learner.step),
+            "inference": inference,
             "config": job.raw,
             "choices": job.choices,
         }
 
     def _save_last(self, trainer: L.Trainer, learner: Learner) -> None:
-        learner.check_finite()  # weights that are not finite are never stored
+        learner.check_finite()
         seconds = self._seconds_before + time.monotonic() - self._start
         training = {
             "optimizer": learner.raw_optimizer().state_dict(),

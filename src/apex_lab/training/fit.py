@@ -57,7 +57,7 @@ def fit(
         ranks: which process this is.
         callbacks: of the configuration, the same on every rank.
         keep, loggers: what stores, of rank 0.
-        folder: where callbacks may leave files; the run's.
+        folder: where callbacks may leave files, and the batch of an update that is not finite; the run's.
         deadline: when time is up, by `time.monotonic`, on rank 0; None for never.
 
     Returns:
@@ -88,7 +88,7 @@ def fit(
         step,
         mode_of(config, device),
     )
-    learner = Learner(update, optimizer, settings.log_interval, ranks.rank, ranks.world)
+    learner = Learner(update, optimizer, settings.log_interval, ranks.rank, ranks.world, folder)
     every = [
         LastValidation(settings.max_steps),
         *callbacks,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import lightning as L
@@ -19,12 +20,18 @@ from torch import nn
 from torch.optim import Optimizer
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.validation import one_line
 from apex_lab.data.video_set import VideoSet
 from apex_lab.evaluation.score import Onlooker, Tally, add_batch, video_set
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.inference.predictor import Batch, Predictor
 from apex_lab.metrics.keys import VALIDATION_SCORES
+from apex_lab.training import watch
 from apex_lab.training.update import WeightUpdate, named_parameters, remember_rates
+from apex_lab.training.watch import Seen, Watch
+
+DECISIVE = ("train/loss", "train/gradient_norm")
+"""What must be finite at every update."""
 
 
 class Diverged(UserError):
@@ -39,6 +46,7 @@ class Learner(L.LightningModule):
         optimizer: named parameters -> optimiser over them.
         log_interval: steps between two logged steps.
         rank, ranks: which process this is, of how many.
+        folder: where rank 0 keeps the batch of an update that is not finite; None: nowhere.
 
     Attributes:
         stop: why training stops before its next step (`apex_lab.training.callbacks.Lockstep` sets it): the number of a
@@ -53,6 +61,7 @@ class Learner(L.LightningModule):
         log_interval: int = 1,
         rank: int = 0,
         ranks: int = 1,
+        folder: Path | None = None,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -61,7 +70,9 @@ class Learner(L.LightningModule):
         self.stop: int | None = None
         self.onlookers: list[Onlooker] = []
         self._optimizer, self._log_interval = optimizer, log_interval
-        self._rank, self._ranks = rank, ranks
+        self._rank, self._ranks, self._folder = rank, ranks, folder
+        # a loss that is not finite on one rank makes the gradient, which is common, so on all: they stop together
+        self._watch = Watch(DECISIVE if ranks == 1 else DECISIVE[1:])
         self._scoring = ScoringPart()
         self._tally: Tally | None = None
         self._clock, self._frames = 0.0, 0
@@ -93,6 +104,7 @@ class Learner(L.LightningModule):
         step = self.step
         self.update(batch["video"], raw, self._rank, self._ranks, self.manual_backward, optimizer.step)
         self._frames += batch["video"].shape[0] * batch["video"].shape[1] * self._ranks
+        self._refuse(self._watch.add(self.step, self.update.latest, batch))
         if self.step % self._log_interval == 0 or self.step == 1:
             self._log(step, raw.param_groups[0]["lr"])
 
@@ -103,6 +115,7 @@ class Learner(L.LightningModule):
         return optimizer
 
     def _log(self, step: int, rate: Any) -> None:
+        self.check_finite()
         row = self.fetch()
         self.logged_loss = row["train/loss"]
         schedules = self.update.schedules.schedules
@@ -124,25 +137,42 @@ class Learner(L.LightningModule):
             dist.all_reduce(stacked)
             stacked /= self._ranks
         row = dict(zip(names, stacked.tolist(), strict=True))
-        self.check_finite(row)
+        if not all(math.isfinite(row.get(name, 0.0)) for name in DECISIVE):
+            raise self._diverged(self.step, row, "")
         return row
 
-    def check_finite(self, row: Mapping[str, float] | None = None) -> None:
-        """Looks at values of the latest step, by default at this rank's own.
+    def check_finite(self) -> None:
+        """Looks at every update so far, whatever the device is still doing.
 
         Raises:
-            Diverged: loss or gradient norm is not finite.
+            Diverged: loss or gradient norm of one is not finite.
         """
-        row = {name: float(value) for name, value in self.update.latest.items()} if row is None else row
-        for name in ("train/loss", "train/gradient_norm"):
-            if not math.isfinite(row.get(name, 0.0)):
-                broken = [n for n, value in row.items() if not math.isfinite(value)]
-                raise Diverged(
-                    f"{name} is {row[name]} at step {self.step} (not finite: {', '.join(broken)}): "
-                    "try a lower optimizer.lr, a lower trainer.gradient_clip_norm or another seed."
-                )
+        self._refuse(self._watch.look())
+
+    def _refuse(self, seen: Seen | None) -> None:
+        """Ends training at an update that is not finite, with its batch kept; all ranks get here at the same step."""
+        if seen is None:
+            return
+        if self._ranks > 1:
+            seen = _of_all_ranks(seen, self._ranks, self.device)
+        kept = ""
+        if self._folder is not None and self._rank == 0:
+            try:
+                kept = f"; its batch is kept in {watch.keep(self._folder, seen)}"
+            except UserError as error:
+                kept = f"; its batch could not be kept: {one_line(error).rstrip('.')}"
+        raise self._diverged(seen.step, seen.row, kept)
+
+    def _diverged(self, step: int, row: Mapping[str, float], kept: str) -> Diverged:
+        name = next(name for name in DECISIVE if not math.isfinite(row.get(name, 0.0)))
+        broken = [n for n, value in row.items() if not math.isfinite(value)]
+        return Diverged(
+            f"{name} is {row[name]} at step {step} (not finite: {', '.join(broken)}{kept}): "
+            "try a lower optimizer.lr, a lower trainer.gradient_clip_norm or another seed."
+        )
 
     def on_validation_epoch_start(self) -> None:
+        self.check_finite()
         self.update.write()
         model = self.update.model
         self._tally = Tally.empty(self._scoring.settings(model.tracks))
@@ -186,6 +216,23 @@ class Learner(L.LightningModule):
     def _record(self, row: dict[str, float]) -> None:
         for logger in self.trainer.loggers:
             logger.log_metrics(row, step=self.step)
+
+
+def _of_all_ranks(seen: Seen, ranks: int, device: torch.device) -> Seen:
+    """An update with the clips of all ranks, and the means of its values."""
+    values = torch.tensor(list(seen.row.values()), device=device)
+    dist.all_reduce(values)
+    row = dict(zip(seen.row, (values / ranks).tolist(), strict=True))
+    shares: list[Any] = [None] * ranks
+    mine = {key: value.cpu() if isinstance(value, torch.Tensor) else value for key, value in seen.batch.items()}
+    dist.all_gather_object(shares, mine)
+    batch = {
+        key: torch.cat([share[key] for share in shares])
+        if isinstance(value, torch.Tensor)
+        else [item for share in shares for item in share[key]]
+        for key, value in mine.items()
+    }
+    return Seen(seen.step, row, batch)
 
 
 def _gathered(tally: Tally, ranks: int) -> Tally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import shutil
 import subprocess
@@ -27,6 +28,9 @@ SLOWEST = 0.01
 
 FAST = ("-crf", "20", "-preset", "veryfast")
 """For long videos."""
+
+TIGHT = 2**20
+"""With fewer free bytes a movie that is not whole is taken for one that found no room."""
 
 
 def ffmpeg() -> str:
@@ -108,7 +112,9 @@ class Mp4:
         self._encoder.close()
         # ffmpeg may fail at its last write, when nobody listens any more
         if kind is None and (count := frames_of(self.path)) != self.written:
-            raise unwritable(self.path, OSError(f"ffmpeg wrote {count} of {self.written} frames"))
+            full = shutil.disk_usage(self.path.absolute().parent).free < TIGHT
+            number = errno.ENOSPC if full else errno.EIO
+            raise unwritable(self.path, OSError(number, f"ffmpeg wrote {count} of {self.written} frames"))
 
 
 def join(path: Path, parts: Sequence[Path], slower: float = 1.0) -> None:
