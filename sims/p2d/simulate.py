@@ -20,8 +20,9 @@ from sims.poses import moved
 from sims.render import Renderer
 from sims.world import STEPS_PER_S, World
 
-CROWDED = 15
-"""If this many first attempts all find no room for the objects, the settings are refused as impossible."""
+CROWDED = 40
+"""If this many first attempts all find no room for the objects, the settings are refused as impossible. With five
+objects, six in ten attempts find none, so that fewer would refuse a large data set for one unlucky trajectory."""
 SETTLE_S = 1.5
 REST_M_S, REST_RAD_S = 0.005, 0.05
 REST_STEPS = 24

@@ -34,8 +34,9 @@ SEEN = 0.4
 OUTLINE_PX = 64
 DROP_M = 0.0005
 TRIES = 20
-CANDIDATES, CROWDED_TRIES = 48, 150
-"""For `CROWDED` objects or more: places drawn at once for one object, and tries."""
+CANDIDATES, CROWDED_TRIES = 48, 50
+"""For `CROWDED` objects or more: places drawn at once for one object, and tries. Most sets of five
+objects that fit do within 40; for the others, attempts with other classes cost less than further tries."""
 SAME_CLASSES = 5
 
 

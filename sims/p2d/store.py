@@ -28,8 +28,9 @@ SPLITS = ("train", "val", "test")
 
 SIMULATION_VERSION = 1
 """Raise whenever the simulation gives other bytes for the same settings, so that old and new data are not mixed."""
-CROWDED_VERSION = 2
-"""Instead of it for settings with `CROWDED` objects or more: 2 since their places are drawn many at once."""
+CROWDED_VERSION = 3
+"""Instead of it for settings with `CROWDED` objects or more: 2 since their places are drawn many at once, 3 since fewer
+tries are made with the same classes."""
 
 FIELDS: dict[str, Field] = {
     "rgb": Field("|u1", ("T", "S", "S", 3)),
