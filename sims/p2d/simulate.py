@@ -22,7 +22,7 @@ from sims.world import STEPS_PER_S, World
 
 CROWDED = 40
 """If this many first attempts all find no room for the objects, the settings are refused as impossible. With five
-objects, six in ten attempts find none, so that fewer would refuse a large data set for one unlucky trajectory."""
+objects, two of three attempts find none, so that fewer would refuse a large data set for one unlucky trajectory."""
 SETTLE_S = 1.5
 REST_M_S, REST_RAD_S = 0.005, 0.05
 REST_STEPS = 24
