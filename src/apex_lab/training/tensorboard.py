@@ -95,9 +95,7 @@ class TensorBoard(TensorBoardLogger, Showing):
         total = {f"{split}/{key}": float(v) for key, v in scored["total"].items() if isinstance(v, int | float)}
         if not any(name.startswith("_hparams_/") for name, _ in self._points):
             with _telling(self._folder):
-                self.log_hyperparams(
-                    self._config, {f"{split}/{key}": float(value) for key, value in total.items()}, step
-                )
+                self.log_hyperparams(self._config, total, step)
                 self.experiment.flush()
         for path in pictures:
             if path.suffix in (".png", ".gif"):
