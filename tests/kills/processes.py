@@ -18,6 +18,7 @@ import json
 import multiprocessing
 import os
 import random
+import re
 import resource
 import runpy
 import signal
@@ -104,6 +105,7 @@ class Running:
         moment: when it is to be killed.
         variables: of its environment, beside those of this process.
         writes: how many writes to files in its folder succeed before its disk is full; None: it never is.
+        logs: where what it says is kept; by default beside its folder.
     """
 
     count = 0
@@ -116,10 +118,11 @@ class Running:
         moment: Moment | None = None,
         variables: Mapping[str, str] | None = None,
         writes: int | None = None,
+        logs: Path | None = None,
     ) -> None:
         Running.count += 1
         self.folder, self.moment = folder, moment
-        self.log = folder.parent / f".{folder.name}_{Running.count}.log"
+        self.log = (logs or folder.parent) / f".{folder.name}_{Running.count}.log"
         self.mark = f"{os.getpid()}_{Running.count}"
         order = {
             **{"entry": entry, "words": list(words), "folder": str(folder), "log": str(self.log)},
@@ -150,7 +153,9 @@ class Running:
                 raise AssertionError(f"it did not end; it said:\n{self.said()}")
         self._settle()
         about = self.log.with_suffix(".json")
-        found = json.loads(about.read_text()) if about.exists() else {"changes": 0, "growth": 0}
+        found = {"changes": 0, "growth": 0}
+        with contextlib.suppress(OSError, ValueError):  # it was killed before or while it wrote that
+            found = json.loads(about.read_text())
         return Ended(self.process.exitcode, self.said(), Measured(used, found["changes"], found["growth"]))
 
     def seconds(self) -> float:
@@ -307,6 +312,10 @@ def _address_space(name: str = "VmSize") -> int:
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
 
 
+IGNORED = re.compile(r"Exception ignored in.*\nTraceback \(most recent call last\):")
+"""What Python prints of libraries whose own clearing up lacks memory."""
+
+
 def drawn(draw: random.Random, whole: Measured, signals: Sequence[int | None], alone: bool = False) -> Moment:
     """A random moment of a command that would take so much.
 
@@ -323,7 +332,7 @@ def drawn(draw: random.Random, whole: Measured, signals: Sequence[int | None], a
         return Moment(None, growth=1 + int(whole.growth * draw.random() ** 4))
     if whole.changes > 1 and draw.random() < 0.4:
         return Moment(signum, change=draw.randrange(1, whole.changes + 1), alone=by_itself)
-    return Moment(signum, seconds=draw.uniform(0.0, whole.seconds), alone=by_itself)
+    return Moment(signum, seconds=draw.uniform(0.0, 0.9 * whole.seconds), alone=by_itself)
 
 
 @dataclass
@@ -368,7 +377,8 @@ def untold(moment: Moment, ended: Ended) -> str | None:
     A request to stop ends in one sentence and 128 + n; want of memory in a sentence and a code, or in the system's own
     end of the process; a traceback is never what a user sees.
     """
-    if "Traceback (most recent call last)" in ended.said:
+    said = IGNORED.sub("", ended.said) if moment.signum is None else ended.said
+    if "Traceback (most recent call last)" in said:
         return "a traceback"
     if moment.signum in (signal.SIGTERM, signal.SIGINT) and ended.code not in (128 + moment.signum, -moment.signum):
         return f"exit code {ended.code} after {signal.Signals(moment.signum).name}"

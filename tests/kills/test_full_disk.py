@@ -78,7 +78,7 @@ def test_a_disk_with_too_little_room(name: str, disk: Path, inputs: Path, unbrok
     words = [word.replace("{inputs}", str(inputs)) for word in work.words]
     place = disk / "work"
     place.mkdir()
-    ended = Running(work.entry, words, place, variables=work.variables).end()
+    ended = Running(work.entry, words, place, variables=work.variables, logs=tmp_path).end()
     assert ended.code == 0, ended.said
     needed = sum(path.stat().st_blocks * 512 for path in place.rglob("*") if path.is_file())
     full, early = 0, 0
@@ -89,7 +89,7 @@ def test_a_disk_with_too_little_room(name: str, disk: Path, inputs: Path, unbrok
         room = draw.randrange(0, needed)
         ballast = disk / ".ballast"
         _fill(ballast, shutil.disk_usage(disk).free - room)
-        ended = Running(work.entry, words, place, variables=work.variables).end()
+        ended = Running(work.entry, words, place, variables=work.variables, logs=tmp_path).end()
         told = f"{name}, seed {SEED}, {room} of {needed} bytes free"
         ballast.unlink()
         if ended.code == 0:
@@ -98,7 +98,7 @@ def test_a_disk_with_too_little_room(name: str, disk: Path, inputs: Path, unbrok
         else:
             full += 1
             check(name, place, ended, told)
-    ended = Running(work.entry, words, place, variables=work.variables).end()
+    ended = Running(work.entry, words, place, variables=work.variables, logs=tmp_path).end()
     assert ended.code == 0, ended.said
     compare(work, place, expected, f"{name}, seed {SEED}")
     print(f"{name} seed {SEED}: the disk was full {full} times, sufficed {early} times")

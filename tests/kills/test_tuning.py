@@ -71,7 +71,7 @@ def test_two_workers_killed_at_random_moments_end_as_unbroken(tmp_path: Path) ->
             told.append(f"{one.moment} -> {ended.code}")
             if one.moment is not None:
                 kills += ended.code != 0
-                assert untold(one.moment, ended) is None, (told, ended.said)
+                assert ended.code == 0 or untold(one.moment, ended) is None, (told, ended.said)
         assert works.not_whole(folder) == [], told
         states = [read_state(file.parent).state for file in folder.rglob("run.json")]
         assert "running" not in states, (states, told)
