@@ -26,7 +26,7 @@ class Asked(BaseModel):
         ({"clips": 0}, "clips = 0 is wrong: input should be greater than or equal to 1."),
         ({"clips": "x"}, "clips = 'x' is wrong: input should be a valid integer, unable to parse string as an integer"),
         ({"folder": ""}, "folder = '' is wrong: it is empty, as an unset variable is: give a path."),
-        ({"folder": ["a", " "]}, "folder.1 = ' ' is wrong: it is empty, as an unset variable is: give a path."),
+        ({"folder": ["a", " "]}, "folder = ['a', ' '] is wrong: it is empty, as an unset variable is: give a path."),
         ({"folder": 3}, "folder = 3 is wrong: input should be a valid string, or input should be a valid "),
         ({"rate": 1e39}, "rate = 1e+39 is wrong: no number in single precision is above 3.40282e+38 in size."),
         (

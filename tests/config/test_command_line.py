@@ -214,7 +214,7 @@ def test_home_folders_of_commands_that_read_runs(
         ("""a=["~/r", '~/s t']""", """a=["/home/me/r", '/home/me/s t']"""),
         ("a=~/r,~/s t", 'a=/home/me/r,"/home/me/s t"'),
         ("video='~/a,b.mp4'", "video='/home/me/a,b.mp4'"),
-        *((word, word) for word in ("a=~nobody/x", "~a", "~a=3", "a=b~/c", 'a="x,~/y"', "a=", "a=[]", "~")),
+        *((word, word) for word in ("a=~no_such_user/x", "~a", "~a=3", "a=b~/c", 'a="x,~/y"', "a=", "a=[]", "~")),
     ],
 )
 def test_where_a_home_folder_is_meant(word: str, wanted: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -29,7 +29,7 @@ from apex_lab.base.files import unwritable
 from apex_lab.base.interrupts import Interrupted, interruptible
 from apex_lab.base.validation import one_line
 from apex_lab.config import elsewhere
-from apex_lab.config.composition import Composed, chosen, composing, conf_dir, plain, told
+from apex_lab.config.composition import Composed, chosen, composing, conf_dir, needing_folders, plain, told
 from apex_lab.config.elsewhere import Origin
 from apex_lab.config.job_list import expand
 from apex_lab.config.options import arrange, only_asks, options, passed_on
@@ -125,7 +125,7 @@ def launch(command: Command) -> None:
             sweep.items = _preflight(command)
             jobs = [item.words for item in sweep.items]
             task = _Task(Origin.here(f"apex_lab.{command.config_name}", passed_on(), jobs), do, sweep)
-            with _raising():
+            with _raising(), needing_folders():
                 _hydra(task, command.config_name)
     except UserError as error:
         console.error(str(error))

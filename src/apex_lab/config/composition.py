@@ -151,14 +151,8 @@ def composing(overrides: Sequence[str], folder: str | None = None) -> Iterator[N
     """
     GlobalHydra.instance().clear()
     try:
-        with warnings.catch_warnings(), initialize_config_dir(version_base="1.3", config_dir=folder or str(conf_dir())):
-            warnings.filterwarnings("error", message=_NOT_AVAILABLE)
+        with initialize_config_dir(version_base="1.3", config_dir=folder or str(conf_dir())), needing_folders():
             yield
-    except UserWarning as error:
-        found = re.match(_NOT_AVAILABLE, str(error))
-        if found is None:
-            raise
-        raise UserError(f"hydra.searchpath: {found[1]} is not available: give folders that are there.") from error
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(told(error, overrides)) from error
     except ValueError as error:
@@ -167,6 +161,24 @@ def composing(overrides: Sequence[str], folder: str | None = None) -> Iterator[N
         raise UserError(_no_choice(overrides)) from error
     finally:
         GlobalHydra.instance().clear()
+
+
+@contextmanager
+def needing_folders() -> Iterator[None]:
+    """Inside, Hydra passes over no folder of its search path that is not there.
+
+    Raises:
+        UserError: there is one.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=_NOT_AVAILABLE)
+        try:
+            yield
+        except UserWarning as error:
+            found = re.match(_NOT_AVAILABLE, str(error))
+            if found is None:
+                raise
+            raise UserError(f"hydra.searchpath: {found[1]} is not available: give folders that are there.") from error
 
 
 _NOT_AVAILABLE = r"provider=.*, path=(.*) is not available"
