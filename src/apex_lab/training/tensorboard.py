@@ -32,8 +32,7 @@ class TensorBoard(TensorBoardLogger, Showing):
     NEEDS: ClassVar = ("tensorboard", "tensorboard")  # the package, and the extra of apex_lab that brings it
 
     def __init__(self, run: Run, pictures: Videos = 2, pictures_every: Interval = 1) -> None:
-        # only rank 0 has loggers, whatever a variable of Slurm's says
-        rank_zero_only.rank = 0  # type: ignore[attr-defined]
+        vars(rank_zero_only)["rank"] = 0  # only rank 0 has loggers, whatever a variable of Slurm's says
         super().__init__(run.folder.resolve(), name="tensorboard", version="", default_hp_metric=False)
         self.pictures, self.pictures_every = pictures, pictures_every
         self._folder, self._config = run.folder.resolve() / "tensorboard", run.job.raw
