@@ -6,6 +6,7 @@ import gc
 import os
 import pickle
 import signal
+import sys
 import threading
 import weakref
 from collections.abc import Callable
@@ -71,6 +72,14 @@ def test_a_swallowed_request_acts_at_the_next_safe_point(happen: Callable[[], No
         work()
     assert reached == ["swallowed"]
     assert raised.value.signum == signal.SIGTERM
+
+
+def test_a_swallowed_request_prints_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[object] = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    with pytest.raises(Interrupted), interruptible():
+        in_del()
+    assert told == []
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")

@@ -225,8 +225,8 @@ def _command(order: dict[str, Any]) -> None:
     if order["writes"] is not None:
         _fill_up(Path(order["folder"]), order["writes"], runs)
     before = _address_space()
-    _limit(order["moment"], before)
     faulthandler.dump_traceback_later(PATIENCE_S - 60, file=sys.__stderr__ or 2)  # where it is stuck
+    _limit(order["moment"], before)
     warnings.filterwarnings("ignore", message=".*found in sys.modules after import.*")  # the server's
     sys.argv = [order["entry"], *order["words"]]
     code: Any = 0
@@ -240,6 +240,7 @@ def _command(order: dict[str, Any]) -> None:
     finally:
         atexit._run_exitfuncs()  # which multiprocessing does not
         runs[0] = False
+        counted[1] = 0
         faulthandler.cancel_dump_traceback_later()
         resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
         about = {"changes": counted[0], "growth": _address_space("VmPeak") - before}
@@ -256,7 +257,7 @@ def _import(entry: str) -> None:
 
 def _count_changes(moment: Moment | None) -> list[int]:
     """Counts changes to files from now on, and ends the process before the one that is due."""
-    counted, me = [0], os.getpid()
+    counted, me = [0, 1], os.getpid()  # so many; whether the command is at work
 
     def hook(event: str, arguments: tuple[Any, ...]) -> None:
         if event == "open":
@@ -264,7 +265,7 @@ def _count_changes(moment: Moment | None) -> list[int]:
                 return
         elif event not in CHANGES:
             return
-        if os.getpid() != me:
+        if os.getpid() != me or not counted[1]:
             return
         counted[0] += 1
         if moment is not None and moment.signum is not None and counted[0] == moment.change:

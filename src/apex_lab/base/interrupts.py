@@ -10,9 +10,11 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 ALWAYS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM") if hasattr(signal, name))
 """Signals that ask to stop."""
@@ -128,9 +130,17 @@ def _listening() -> Iterator[None]:
     for number in taken:
         signal.signal(number, _receive)
     _state.listening += 1
+    reported = sys.unraisablehook
+
+    def report(what: Any) -> None:
+        if not isinstance(what.exc_value, Interrupted):  # the note of it acts; a traceback would only alarm
+            reported(what)
+
+    sys.unraisablehook = report
     try:
         yield
     finally:
+        sys.unraisablehook = reported
         _state.listening -= 1
         if _state.listening == 0:
             _state.signum = None
