@@ -110,7 +110,7 @@ def ends_well(command: Callable[..., Ended], entry: str, words: list[str], folde
     began = time.process_time()
     ended = command(entry, *words)  # raises what the command lets through
     assert time.process_time() - began < SECONDS
-    assert "Traceback" not in ended.out + ended.err, ended.err
+    assert "Traceback" not in ended.out + ended.err, ascii(ended.err)
     assert ended.code in (0, 1, 2)
     assert ended.code == 0 or ended.err.strip()
 
@@ -235,7 +235,7 @@ def test_programs_with_options(
         code = 1
     said = capsys.readouterr()
     assert time.process_time() - began < SECONDS
-    assert "Traceback" not in said.out + said.err, said.err
+    assert "Traceback" not in said.out + said.err, ascii(said.err)
     assert code in (0, 1, 2, None)
     assert code in (0, None) or said.err.strip() or said.out.strip()
 

@@ -56,7 +56,7 @@ REFUSED = {
     "data.frames=${nope}": "Interpolation key 'nope' not found.",
     "evaluation.split=tst": "evaluation.split = 'tst' is wrong: input should be 'train', 'val' or 'test'.",
     "callbacks.progress.seconds=0": "callbacks.progress.seconds = 0 is wrong: input should be greater than 0.",
-    "logger=wand": "logger=wand: there is no such choice in csv, wandb; did you mean 'wandb'?",
+    "logger=wand": "logger=wand: there is no such choice in csv, tensorboard, wandb; did you mean 'wandb'?",
     "scale=cpuu": "did you mean 'cpu'?",
     "+ablation=no_entropi": "did you mean 'no_entropy'?",
     "+ablation=[no_entropy,gaussian]": "puts several into one run: write +ablation=no_entropy,gaussian -m to run each.",
