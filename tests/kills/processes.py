@@ -313,6 +313,9 @@ def _address_space(name: str = "VmSize") -> int:
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
 
 
+START_BYTES = 2**24
+"""What Python itself needs to start a module that is imported already."""
+
 IGNORED = re.compile(r"Exception ignored in.*\nTraceback \(most recent call last\):")
 """What Python prints of libraries whose own clearing up lacks memory."""
 
@@ -330,7 +333,7 @@ def drawn(draw: random.Random, whole: Measured, signals: Sequence[int | None], a
     by_itself = alone and draw.random() < 0.5
     if signum is None:
         # most of the growth is room that is reserved and never used, so small limits are the ones that matter
-        return Moment(None, growth=1 + int(whole.growth * draw.random() ** 4))
+        return Moment(None, growth=START_BYTES + int(whole.growth * draw.random() ** 4))
     if whole.changes > 1 and draw.random() < 0.4:
         return Moment(signum, change=draw.randrange(1, whole.changes + 1), alone=by_itself)
     return Moment(signum, seconds=draw.uniform(0.0, 0.9 * whole.seconds), alone=by_itself)

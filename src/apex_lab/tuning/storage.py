@@ -6,14 +6,17 @@ journal files they are here: a file per trial beside the journal, touched by its
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import optuna
 from optuna.storages import BaseStorage, JournalStorage, RDBStorage
 from optuna.storages._heartbeat import BaseHeartbeat  # what Optuna's own storages inherit; it has no public name
 from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal._file import get_lock_file  # its release after a time; it has no public name
 from optuna.trial import FrozenTrial, TrialState
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
@@ -28,6 +31,49 @@ GRACE = 4
 """A trial is lost after so many heartbeats without one."""
 
 
+class _File(JournalFileBackend):
+    """A journal file that kills and full disks leave readable.
+
+    Optuna's lock is a link to the journal. Of a relative path it leads nowhere, and then the lock of a killed worker is
+    waited for without end, instead of the 30 seconds after which it is taken away; so the path is absolute here.
+
+    Args:
+        path: the journal.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path.absolute()
+        lock = self._path.with_name(f"{self._path.name}.lock")
+        if lock.is_symlink() and not lock.exists():  # of an earlier version, which gave the path as it came
+            lock.unlink(missing_ok=True)
+        super().__init__(str(self._path))
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """Appends lines, after what half a line a death or a full disk has left is cut off."""
+        with get_lock_file(self._lock):
+            _cut_off_half_a_line(self._path)
+        try:
+            super().append_logs(logs)
+        except OSError as error:
+            raise unwritable(self._path, error) from error
+
+
+def _cut_off_half_a_line(path: Path) -> None:
+    with open(path, "r+b") as file:
+        size = file.seek(0, os.SEEK_END)
+        place = size
+        while place:  # the last line may be long
+            start = max(0, place - 4096)
+            file.seek(start)
+            end = file.read(place - start).rfind(b"\n")
+            if end >= 0:
+                place = start + end + 1
+                break
+            place = start
+        if place < size:
+            file.truncate(place)
+
+
 class Journal(JournalStorage, BaseHeartbeat):
     """A journal file with heartbeats.
 
@@ -40,7 +86,7 @@ class Journal(JournalStorage, BaseHeartbeat):
     """
 
     def __init__(self, path: Path, interval_s: int, stale: Stale) -> None:
-        super().__init__(JournalFileBackend(str(path)))
+        super().__init__(_File(path))
         self._alive = make_folder(path.with_name(f"{path.name}.alive"))
         self._interval, self._stale = interval_s, stale
 
