@@ -23,6 +23,7 @@ def composed(scale: str, *words: str) -> Any:
     chosen = [
         "+model=slot_attention",
         f"+recipe=slot_attention/{scale}",
+        "+paths=default",
         "+data=sprites",
         f"data.image_size={SIDES[scale]}",
         *words,
