@@ -399,7 +399,7 @@ def test_wrong_commands_are_refused_in_one_sentence(command: Callable[..., Ended
         (
             "checkpoint=apex-p2d-cpu",
             "video=",
-        ): "video is empty: give a file, a folder, a pattern with * or a camera (0).",
+        ): "video = '' is wrong: it is empty, as an unset variable is: give a path.",
         (
             "checkpoint=apex-p2d-cpu",
             f"video={EXAMPLE}",

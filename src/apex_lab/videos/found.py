@@ -33,8 +33,6 @@ def find_videos(patterns: str | Sequence[str]) -> list[Source]:
     """
     found: dict[object, Source] = {}
     for pattern in [patterns] if isinstance(patterns, str) else patterns:
-        if not pattern.strip():
-            raise UserError("video is empty: give a file, a folder, a pattern with * or a camera (0).")
         if pattern.isdecimal() and not to_open("video", pattern).exists():
             number = camera_number(pattern)
             found.setdefault(number, number)
