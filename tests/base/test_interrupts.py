@@ -74,6 +74,19 @@ def test_a_swallowed_request_acts_at_the_next_safe_point(happen: Callable[[], No
     assert raised.value.signum == signal.SIGTERM
 
 
+def test_what_a_stopped_library_raises_is_the_request() -> None:
+    def work() -> None:
+        try:
+            ask()
+        finally:
+            raise AttributeError("half done")
+
+    with pytest.raises(Interrupted), interruptible():
+        work()
+    with pytest.raises(AttributeError, match="by itself"), interruptible():
+        raise AttributeError("by itself")
+
+
 def test_a_swallowed_request_prints_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[object] = []
     monkeypatch.setattr(sys, "unraisablehook", told.append)

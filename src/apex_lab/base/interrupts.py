@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from apex_lab.base.errors import UserError
+
 ALWAYS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM") if hasattr(signal, name))
 """Signals that ask to stop."""
 
@@ -76,9 +78,19 @@ def check() -> None:
 
 @contextlib.contextmanager
 def interruptible() -> Iterator[None]:
-    """A request to stop raises `Interrupted` wherever the program is, and at the end of the block at the latest."""
+    """A request to stop raises `Interrupted` wherever the program is, and at the end of the block at the latest.
+
+    Libraries that are stopped halfway may raise something else; that is the request's doing and becomes `Interrupted` too.
+    """
     with _listening():
-        yield
+        try:
+            yield
+        except UserError:
+            raise
+        except Exception as error:
+            if _state.signum is not None and not _state.deferring:
+                raise Interrupted(_state.signum) from error
+            raise
         check()
 
 
