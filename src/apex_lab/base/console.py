@@ -66,22 +66,27 @@ def put(text: str, error: bool = False) -> None:
 
 def note(message: str) -> None:
     """For log.txt alone."""
-    _LOG.debug(message)
+    _LOG.debug(_encodable(message))
 
 
 def say(message: str) -> None:
     """A line for the person who waits."""
-    _LOG.info(message)
+    _LOG.info(_encodable(message))
 
 
 def warn(message: str) -> None:
     """Prints a warning; work continues."""
-    _LOG.warning(message)
+    _LOG.warning(_encodable(message))
 
 
 def error(message: str) -> None:
     """Why something ends here."""
-    _LOG.error(message)
+    _LOG.error(_encodable(message))
+
+
+def _encodable(message: str) -> str:
+    """Bytes of the command line that are no text (lone surrogates) as `\\udcff`, which every reader can encode."""
+    return message.encode("utf-8", "backslashreplace").decode()
 
 
 @contextlib.contextmanager
