@@ -67,8 +67,7 @@ def test_clips_that_are_not_there_are_refused_before_any_is_drawn(
         (("checkpoints=apex-p2d-cpu", "frames=3"), "frames = 3 goes with video=... alone: leave it out."),
         (
             ("checkpoints=apex-p2d-cpu", "clips=[]"),
-            "clips = [] is wrong: list should have at least 1 item after "
-            "validation, not 0.",
+            "clips = [] is wrong: list should have at least 1 item after validation, not 0.",
         ),
         (
             ("checkpoints=apex-p2d-cpu", "accelerator=gpu"),
