@@ -20,7 +20,7 @@ from tests.kills.works import WORKS
 
 Unbroken = Callable[[str], tuple[dict[str, object], Measured]]
 
-FAST = {"training": 40, "evaluation": 10, "prediction": 14}
+FAST = {"training": 40, "evaluation": 10}
 """Command -> writes among which one is drawn; docs/reliability.md names them."""
 
 SLOW = {

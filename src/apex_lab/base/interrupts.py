@@ -80,7 +80,7 @@ def check() -> None:
 def interruptible() -> Iterator[None]:
     """A request to stop raises `Interrupted` wherever the program is, and at the end of the block at the latest.
 
-    What libraries raise that are stopped halfway is the request's doing, and becomes `Interrupted` too.
+    Libraries that are stopped halfway may raise something else; that is the request's doing, and becomes `Interrupted`.
     """
     with _listening():
         try:
