@@ -9,7 +9,16 @@ from pathlib import Path
 import pytest
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import make_folder, read_json, replacing, unwritable, write_json, write_text, writing
+from apex_lab.base.files import (
+    clear_drafts,
+    make_folder,
+    read_json,
+    replacing,
+    unwritable,
+    write_json,
+    write_text,
+    writing,
+)
 
 
 def test_a_file_changes_only_when_it_is_whole(tmp_path: Path) -> None:
@@ -65,3 +74,11 @@ def test_a_full_disk_is_told_with_its_free_space(tmp_path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
     with pytest.raises(OSError, match="elsewhere"), writing(tmp_path / "file"):
         raise OSError(errno.EIO, "elsewhere")
+
+
+def test_what_a_kill_left_of_a_file_is_removed(tmp_path: Path) -> None:
+    left = [".a.csv.7.apex_lab.part", ".a.csv.12.apex_lab.part", ".ab.csv.7.apex_lab.part", ".a.csv.part", "a.csv"]
+    for name in left:
+        (tmp_path / name).touch()
+    clear_drafts(tmp_path, ["a.csv", "b.csv"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(left[2:])

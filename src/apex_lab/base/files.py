@@ -8,7 +8,7 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,6 +28,13 @@ def drafts(folder: Path, of: str | None = None) -> list[Path]:
     """The files in the making in a folder; those of one name, if it is given. None where there is no folder."""
     found = [path for path in folder.glob(".*.apex_lab.part") if DRAFT.fullmatch(path.name) and path.is_file()]
     return [path for path in found if of is None or re.fullmatch(rf"\.{re.escape(of)}\.\d+\.apex_lab\.part", path.name)]
+
+
+def clear_drafts(folder: Path, names: Iterable[str]) -> None:
+    """Removes what kills in the middle of writing have left of some files, which no other process may be writing."""
+    for name in names:
+        for draft in drafts(folder, name):
+            draft.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

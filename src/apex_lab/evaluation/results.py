@@ -10,7 +10,7 @@ import pandas as pd
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import make_folder, read_json, set_aside, write_json, write_text
+from apex_lab.base.files import clear_drafts, make_folder, read_json, set_aside, write_json, write_text
 from apex_lab.evaluation.pictures import Chosen
 from apex_lab.evaluation.score import Tally
 from apex_lab.formats.scored_files import plain
@@ -86,8 +86,10 @@ def store(
             "pictures": [row._asdict() for row in chosen],
         }
     )
-    write_text(folder / f"per_video_{split}.csv", pd.DataFrame(videos).to_csv(index=False))
-    write_text(folder / f"objects_{split}.csv", result["per_object"].to_csv(index=False))
+    tables = {f"per_video_{split}.csv": pd.DataFrame(videos), f"objects_{split}.csv": result["per_object"]}
+    clear_drafts(folder, [*tables, path.name])
+    for name, table in tables.items():
+        write_text(folder / name, table.to_csv(index=False))
     top = {"settings": scored["settings"], "versions": scored["versions"], **(beside or {})}
     write_json(path, {**content, **top, "splits": {**content.get("splits", {}), split: scored}})
     return scored
