@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import TextIO
 
 import pytest
 
@@ -24,6 +25,10 @@ def test_characters_that_a_terminal_lacks_are_replaced(monkeypatch: pytest.Monke
     assert raw.getvalue().decode("latin-1") == "? done, \\udcff\n? printed by a library\n"
 
 
+def leads_nowhere(stream: TextIO) -> bool:
+    return os.path.samestat(os.fstat(stream.fileno()), os.stat(os.devnull))
+
+
 def test_a_pipe_that_nobody_reads_ends_quietly(monkeypatch: pytest.MonkeyPatch) -> None:
     reader, writer = os.pipe()
     os.close(reader)
@@ -32,6 +37,7 @@ def test_a_pipe_that_nobody_reads_ends_quietly(monkeypatch: pytest.MonkeyPatch) 
     console.setup()
     console.say("one")
     console.say("two")
+    assert leads_nowhere(stream)
     stream.close()  # what was left over goes nowhere, too
 
 
@@ -42,6 +48,7 @@ def test_what_libraries_print_into_such_a_pipe_is_dropped(monkeypatch: pytest.Mo
     console.setup()
     print("much\n" * 10_000)
     print("a little", flush=True)
+    assert leads_nowhere(sys.stdout)
     sys.stdout.close()
 
 
@@ -75,6 +82,7 @@ def test_a_stream_that_is_closed_leads_nowhere(monkeypatch: pytest.MonkeyPatch) 
     console.setup()
     console.say("nobody")
     print("hears this")
+    assert sys.stdout.name == os.devnull
     sys.stdout.close()
 
 
