@@ -101,7 +101,7 @@ class _Terminated(KeyboardInterrupt):
 
 @contextmanager
 def _terminable() -> Iterator[None]:
-    """Ends the work in order on SIGTERM too, as a scheduler sends it."""
+    """Ends the work in order on Ctrl-C, and on SIGTERM too, as a scheduler sends it."""
 
     def stop(*_: object) -> None:
         raise _Terminated
@@ -109,8 +109,12 @@ def _terminable() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, stop)
+    before = {signum: signal.getsignal(signum) for signum in (signal.SIGTERM, signal.SIGINT)}
+    signal.signal(signal.SIGTERM, stop)
+    if before[signal.SIGINT] is signal.SIG_DFL:  # as while a command starts (`sims`)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for signum, handler in before.items():
+            signal.signal(signum, handler)

@@ -7,9 +7,15 @@ scene = segmenter(frames)                  # uint8 (T, H, W, 3), NumPy or PyTorc
 from __future__ import annotations
 
 import importlib
+import signal
+import sys
 from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if sys.argv[:1] == ["-m"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    # a command is starting: until it listens itself, Ctrl-C ends it without a traceback of its imports
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 if TYPE_CHECKING:
     from apex_lab.base.errors import UserError

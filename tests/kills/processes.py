@@ -212,6 +212,7 @@ def _seconds(pid: int, children: bool = True) -> float:
 def _command(order: dict[str, Any]) -> None:
     """In the fork: becomes the command."""
     os.setsid()
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # as the packages do under `python -m`; the server has them already
     os.chdir(order["folder"])
     os.environ.update(order["variables"], PWD=order["folder"])
     log = os.open(order["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)

@@ -54,6 +54,8 @@ def ending(code: int = CONFIG_ERROR) -> Iterator[None]:
         code: of the process.
     """
     console.setup()
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:  # as while a command starts (`apex_lab`)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with faults.net():
             yield
