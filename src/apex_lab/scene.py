@@ -143,6 +143,9 @@ class SceneModel(nn.Module):
     schedule_ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """Scheduled values that `forward` reads: name -> smallest and largest allowed value."""
 
+    optional_schedules: ClassVar[tuple[str, ...]] = ()
+    """Those of `schedule_ranges` that a configuration may leave out."""
+
     needs_training: bool = True
     """False for models that have nothing to learn by gradient (the classical yardsticks)."""
 

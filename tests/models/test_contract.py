@@ -34,7 +34,7 @@ SCHEDULES = {
     # objects live long enough for a gradient to pass through the recurrence of propagation
     "apex": {"carry": 1.0, "discover": 1.0},
     # the foreground takes part
-    "gswm": {"background_only": 0.0},
+    "gswm": {"background_only": 0.0, "fixed_alpha": 0.0},
 }
 """Model -> scheduled values that the checks need."""
 

@@ -394,7 +394,7 @@ def _check_objective(config: Config) -> None:
     ranges |= {f"schedule.{name}": within for name, within in model.schedule_ranges.items()}
     for key, value in values.items():
         check_range(key, value, ranges[key], config.trainer.max_steps)
-    _same_names("schedule", schedules, model.schedule_ranges)
+    _same_names("schedule", schedules, model.schedule_ranges, model.optional_schedules)
     _same_names("loss", weights, model.term_names)
     if model.needs_training:
         _check_early_stopping(config, model, source.labelled)
@@ -492,14 +492,14 @@ def _check_splits(config: Config) -> None:
         )
 
 
-def _same_names(key: str, given: Mapping[str, object], wanted: Collection[str]) -> None:
+def _same_names(key: str, given: Mapping[str, object], wanted: Collection[str], optional: Collection[str] = ()) -> None:
     for name in given:
         if name not in wanted:
             raise UserError(
                 sentence(f"Unknown key {key}.{name}: the model has {_listed(wanted)}{did_you_mean(name, wanted)}")
             )
     for name in wanted:
-        if name not in given:
+        if name not in given and name not in optional:
             raise UserError(f"{key}.{name} is missing: the model needs {_listed(wanted)}.")
 
 

@@ -174,6 +174,21 @@ def test_background_only() -> None:
     assert not torch.equal(with_objects["nll"], terms["nll"])
 
 
+def test_fixed_alpha() -> None:
+    """While it lasts, objects fill their windows by that much, and the decoded masks learn nothing."""
+    model = tiny().eval()
+    free, zero = (model(video(), context(**more)) for more in ({}, {"fixed_alpha": 0.0}))
+    assert torch.equal(free.masks, zero.masks)
+    scene = model(video(), context(fixed_alpha=0.25))
+    assert not torch.equal(scene.masks, free.masks)
+    assert scene.masks[:, :, :-1].sum(2).max() <= 0.25 + 1e-6  # the last is the background's
+    loss(scene.terms).backward()
+    weight = next(p for p in reversed(list(model.renderer.decoder.parameters())) if p.grad is not None)
+    assert weight.grad is not None
+    assert weight.grad[:3].any()
+    assert not weight.grad[3:].any()
+
+
 def test_schedules_reach_their_terms() -> None:
     model = tiny().eval()
     base = model(video(), context()).terms
@@ -186,7 +201,14 @@ def test_schedules_reach_their_terms() -> None:
     assert changed(presence_prior=0.1) == {"kl_pres", "presence_cost"}
     assert changed(scale_mean=-2.0) == {"kl_where"}
     assert {"nll", "kl_what"} <= changed(temperature=2.0)
-    assert set(model.schedule_ranges) == {"temperature", "presence_prior", "scale_mean", "sigma", "background_only"}
+    assert set(model.schedule_ranges) == {
+        "temperature",
+        "presence_prior",
+        "scale_mean",
+        "sigma",
+        "background_only",
+        "fixed_alpha",
+    }
 
 
 def test_terms_are_sums_over_frames() -> None:
@@ -221,7 +243,7 @@ def test_recipes_fit_the_model(size: int, files: list[str]) -> None:
     config: Any = OmegaConf.to_container(OmegaConf.merge({"data": {"image_size": size}}, *nodes), resolve=True)
     components.check(config["model"], "model")
     model = instantiate(config["model"], _convert_="all").eval()
-    assert set(config["schedule"]) == set(model.schedule_ranges)
+    assert set(config["schedule"]) | set(model.optional_schedules) == set(model.schedule_ranges)
     assert set(config["loss"]) == set(model.term_names)
     assert config["clips"]["frames"]["values"] == sorted(config["clips"]["frames"]["values"])
     with torch.no_grad():

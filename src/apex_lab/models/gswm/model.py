@@ -108,7 +108,9 @@ class Gswm(SceneModel):
         "scale_mean": (-10.0, 10.0),
         "sigma": (1e-3, 100.0),
         "background_only": (0.0, 1.0),
+        "fixed_alpha": (0.0, 1.0),
     }
+    optional_schedules = ("fixed_alpha",)
 
     def __init__(
         self,
@@ -161,7 +163,8 @@ class Gswm(SceneModel):
             context: its schedule holds `temperature` of the relaxed Bernoulli; `presence_prior`, the prior probability
                 of z_pres; `scale_mean`, mean of the prior of a discovered object's raw size; `sigma`, standard
                 deviation of the likelihood; `background_only`: while it is 1, the background explains frames alone
-                and objects cost nothing.
+                and objects cost nothing; `fixed_alpha` (may be missing): above 0, the mask that every object has all
+                over its window.
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(
@@ -249,7 +252,10 @@ class Gswm(SceneModel):
         z, ids, source = (torch.stack(x, dim=1) for x in zip(*(step[:3] for step in steps), strict=True))
         objects = attributes(z, self.what)
         drawn = self.renderer(
-            Attributes(*(part.flatten(0, 1) for part in objects)), backdrop.images.flatten(0, 1), context.detail
+            Attributes(*(part.flatten(0, 1) for part in objects)),
+            backdrop.images.flatten(0, 1),
+            context.detail,
+            schedule.get("fixed_alpha"),
         )
         found = Posterior(*(torch.stack(parts, dim=1) for parts in zip(*(s.posterior for s in steps), strict=True)))
         tracked = [step.propagated for step in steps if step.propagated is not None]

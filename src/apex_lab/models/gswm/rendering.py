@@ -84,18 +84,31 @@ class Renderer(nn.Module):
         self.decoder = Decoder(what, glimpse, widths, 4, activation=True)
         self.glimpse, self.image_size = glimpse, image_size
 
-    def forward(self, objects: Attributes, backdrop: Float[Tensor, "N 3 H W"], detail: bool = False) -> Drawn:
-        """Objects (N, M, ...) of N frames and the background's images -> `Drawn`."""
+    def forward(
+        self,
+        objects: Attributes,
+        backdrop: Float[Tensor, "N 3 H W"],
+        detail: bool = False,
+        fixed_alpha: Float[Tensor, ""] | None = None,
+    ) -> Drawn:
+        """Objects (N, M, ...) of N frames and the background's images -> `Drawn`.
+
+        Args:
+            fixed_alpha: above 0, it takes the place of the decoded masks.
+        """
         m = objects.what.shape[1]
         size = part_size(len(backdrop), 4 * m * self.image_size**2, backdrop)
         split = (Attributes(*part) for part in zip(*(x.split(size) for x in objects), strict=True))
-        parts = [self._part(part, behind, detail) for part, behind in zip(split, backdrop.split(size), strict=True)]
+        behind = backdrop.split(size)
+        parts = [self._part(part, some, detail, fixed_alpha) for part, some in zip(split, behind, strict=True)]
         masks, reconstruction, means = zip(*parts, strict=True)
         return Drawn(joined(masks), joined(reconstruction), joined(means) if detail else None)
 
-    def _part(self, objects: Attributes, backdrop: Tensor, detail: bool) -> Drawn:
+    def _part(self, objects: Attributes, backdrop: Tensor, detail: bool, fixed_alpha: Tensor | None) -> Drawn:
         glimpses = precise(self.decoder(objects.what.flatten(0, 1))).unflatten(0, objects.what.shape[:2])
         colour, alpha = glimpses.split([3, 1], dim=2)
+        if fixed_alpha is not None:
+            alpha = torch.where(fixed_alpha > 0, fixed_alpha, alpha)
         alpha = alpha * objects.pres[..., None, None]
         paster = Paster(paste_window(objects.where), self.glimpse, self.image_size)
         pasted = paster.each(torch.cat([alpha * colour, alpha], dim=2))
