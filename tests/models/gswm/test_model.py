@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from apex_lab.config import components
 from apex_lab.models.gswm import Gswm
+from apex_lab.models.gswm.latents import Attributes
 from apex_lab.scene import ABSENT, Scene
 from tests.models.gswm.small import SIZE, context, double, loss, tiny, video
 
@@ -182,11 +183,26 @@ def test_fixed_alpha() -> None:
     scene = model(video(), context(fixed_alpha=0.25))
     assert not torch.equal(scene.masks, free.masks)
     assert scene.masks[:, :, :-1].sum(2).max() <= 0.25 + 1e-6  # the last is the background's
-    loss(scene.terms).backward()
-    weight = next(p for p in reversed(list(model.renderer.decoder.parameters())) if p.grad is not None)
-    assert weight.grad is not None
-    assert weight.grad[:3].any()
-    assert not weight.grad[3:].any()
+
+
+def test_fixed_alpha_takes_the_place_of_the_decoded_one() -> None:
+    """A single object: a quarter of its colour, three quarters of the background, wherever its window is."""
+    model = tiny()
+    objects = Attributes(
+        pres=torch.ones(2, 1, 1),
+        depth=torch.zeros(2, 1, 1),
+        where=torch.tensor([0.8, 0.8, 0.0, 0.0]).expand(2, 1, 4),
+        what=torch.randn(2, 1, 5),
+        dyna=torch.zeros(2, 1, 7),
+    )
+    backdrop = torch.rand(2, 3, SIZE, SIZE)
+    drawn = model.renderer(objects, backdrop, detail=True, fixed_alpha=torch.tensor(0.25))
+    assert drawn.means is not None
+    inside = (slice(None), slice(None), slice(12, 20), slice(12, 20))
+    torch.testing.assert_close(drawn.masks[inside], torch.full((2, 1, 8, 8), 0.25), atol=2e-4, rtol=0)
+    torch.testing.assert_close(
+        drawn.reconstruction[inside], 0.25 * drawn.means[:, 0][inside] + 0.75 * backdrop[inside], atol=2e-4, rtol=0
+    )
 
 
 def test_schedules_reach_their_terms() -> None:
