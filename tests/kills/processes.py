@@ -314,7 +314,7 @@ def _address_space(name: str = "VmSize") -> int:
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:"))
 
 
-START_BYTES = 2**24
+START_BYTES = 2**25
 """What Python itself needs to start a module that is imported already."""
 
 IGNORED = re.compile(r"Exception ignored in.*\nTraceback \(most recent call last\):")
