@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from apex_lab.base.errors import UserError
-from apex_lab.videos import find_videos, open_video
+from apex_lab.videos import find_videos, open_video, reader
 from apex_lab.videos.reader import Camera
 from tests.videos.made import encode, moving, program
 
@@ -31,6 +31,18 @@ def test_frames_come_back_as_they_were_written(tmp_path: Path) -> None:
     assert images(path, 0).dtype == np.uint8
     assert list(video.frames(7)) == []
     assert [frame.time for frame in video.frames()] == pytest.approx([0.1 * t for t in range(7)], abs=1e-6)
+
+
+def test_too_little_memory_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """OpenCV would give the frame before once more."""
+    path = encode(tmp_path / "clip.mkv", moving(3))
+    frames = open_video(path).frames()
+    next(frames)
+    monkeypatch.setattr(reader, "SPARE_BYTES", 2**62)
+    with pytest.raises(MemoryError):
+        next(frames)
+    with pytest.raises(MemoryError):
+        open_video(path)
 
 
 @pytest.mark.parametrize("size", [(47, 63), (1, 1), (2160, 3840)])

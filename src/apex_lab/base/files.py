@@ -162,6 +162,8 @@ def unwritable(path: Path, error: OSError) -> UserError:
             f"No space left for {path} ({cause}{free_space(path)}): free some and run the same command again; "
             "nothing stored was lost."
         )
+    if error.errno is None:  # an encoder's own trouble, such as want of memory; the system has refused nothing
+        return UserError(f"{short(str(path))} cannot be written: {one_line(error)}.")
     why = error.strerror or one_line(error)
     return UserError(f"{short(str(path))} cannot be written ({why}): choose another folder or its permissions.")
 

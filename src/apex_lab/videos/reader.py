@@ -25,6 +25,9 @@ from apex_lab.videos.pictures import is_picture, pages_of, pictures_in, read_pag
 Source = Path | int
 """A file or a folder of pictures; the number of a camera."""
 
+SPARE_BYTES = 2**25
+"""Memory that is free when a frame is decoded, beside that for the frame."""
+
 STILLS_PER_SECOND = 10.0
 """Nominal, for pictures, which have no times."""
 
@@ -278,11 +281,27 @@ def _opened(*what: Any) -> Any:
 
 
 def _next(capture: Any) -> UInt8[np.ndarray, "H W 3"] | None:
-    """The next frame as RGB; None at the end, and where there is nothing to read."""
+    """The next frame as RGB; None at the end, and where there is nothing to read.
+
+    Raises:
+        MemoryError: there may be too little for it.
+    """
+    pixels = capture.get(cv2.CAP_PROP_FRAME_HEIGHT) * capture.get(cv2.CAP_PROP_FRAME_WIDTH)
+    _memory_for(int(pixels) if 0 < pixels < 2**31 else 0)
     found, image = capture.read()
     if not found or image is None or image.size == 0:
         return None
     return cv2.cvtColor(image, cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB)
+
+
+def _memory_for(pixels: int) -> None:
+    """Asks the system for as much as a frame may need and gives it back: without memory OpenCV's decoder leaves frames
+    out, or gives an old one for a new one, and does not say so.
+
+    Raises:
+        MemoryError: that much is not there.
+    """
+    np.empty(SPARE_BYTES + 48 * pixels, dtype=np.uint8)
 
 
 def _check_size(image: np.ndarray, size: tuple[int, int], where: str) -> None:
