@@ -250,7 +250,8 @@ def check_posterior(case: Case) -> None:
 
 
 def check_schedule_names(case: Case) -> None:
-    """`schedule_ranges` names what `forward` and `posterior` read: they need no more, and miss any that is left out."""
+    """`schedule_ranges` names what `forward` and `posterior` read: they need no more, and miss any that is left out,
+    but for `optional_schedules`."""
 
     def missed(values: Mapping[str, float], training: bool) -> str | None:
         """The first name that is not there when the model looks for it."""
@@ -266,7 +267,10 @@ def check_schedule_names(case: Case) -> None:
     for name in sorted(named):
         others = {n: v for n, v in values.items() if n != name}
         read = any(missed(others, training) == name for training in (True, False))
-        _require(read, case, f"schedule_ranges names {name!r}, which is not read")
+        if name in case.model.optional_schedules:
+            _require(not read, case, f"optional_schedules names {name!r}, which is missed when it is left out")
+        else:
+            _require(read, case, f"schedule_ranges names {name!r}, which is not read")
 
 
 def check_schedule_ends(case: Case) -> None:

@@ -255,7 +255,7 @@ class Gswm(SceneModel):
             Attributes(*(part.flatten(0, 1) for part in objects)),
             backdrop.images.flatten(0, 1),
             context.detail,
-            schedule["fixed_alpha"] if "fixed_alpha" in schedule else None,
+            schedule.get("fixed_alpha"),
         )
         found = Posterior(*(torch.stack(parts, dim=1) for parts in zip(*(s.posterior for s in steps), strict=True)))
         tracked = [step.propagated for step in steps if step.propagated is not None]
