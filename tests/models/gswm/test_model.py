@@ -176,7 +176,7 @@ def test_background_only() -> None:
 
 
 def test_fixed_alpha() -> None:
-    """While it lasts, objects fill their windows by that much, and the decoded masks learn nothing."""
+    """At 0 nothing changes; above 0 objects share at most that much of a pixel."""
     model = tiny().eval()
     free, zero = (model(video(), context(**more)) for more in ({}, {"fixed_alpha": 0.0}))
     assert torch.equal(free.masks, zero.masks)
