@@ -152,5 +152,5 @@ class Rejection:
 
 
 def room(valid: Bool[Tensor, "B P"], limit: int) -> Int[Tensor, " B"]:
-    """How many new objects a video may have in a frame, given the slots that came into it; at least 0."""
+    """How many new objects a video may have in a frame, given the slots that hold one already; at least 0."""
     return (limit - valid.sum(1)).clamp_min(0)

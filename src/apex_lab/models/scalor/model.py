@@ -58,8 +58,8 @@ class Scalor(SceneModel):
         sigma: standard deviation of a pixel's likelihood.
         max_objects: P, objects that a video can carry. In training, the weakest discoveries beyond it are cut off and
             not rendered either, as published.
-        evaluation_objects: P in evaluation, where discoveries that find no slot are rendered, but not carried on;
-            null: as `max_objects`. The original sets no limit.
+        evaluation_objects: P in evaluation, where the weakest discoveries that find no slot are rendered, but not
+            carried on; null: as `max_objects`. The original sets no limit.
         track: a discovery with a presence above this is carried on.
         stop: an object whose absence, summed over its life, reaches this is deleted.
         background_decoder: "weak" draws smooth backgrounds only, for data where the background explains everything.

@@ -80,6 +80,19 @@ def strongest(presence: Float[Tensor, "B D"], count: Int[Tensor, " B"]) -> Bool[
     return (presence > limit) | (count >= d)[:, None]
 
 
+def admitted(
+    arrives: Bool[Tensor, "B D"], presence: Float[Tensor, "B D"], free: Int[Tensor, " B"]
+) -> Bool[Tensor, "B D"]:
+    """The arriving cells that find a slot: the `free` strongest; of equally strong ones the first, row by row.
+
+    The original has no limit in evaluation. Here slots are limited, so where one is missing, what is least surely an
+    object goes without, not what stands in the last rows of the image.
+    """
+    score = presence.masked_fill(~arrives, -torch.inf)
+    rank = score.argsort(dim=1, descending=True, stable=True).argsort(dim=1)
+    return arrives & (rank < free[:, None])
+
+
 def pack(chosen: Bool[Tensor, "B K"], slots: int) -> tuple[Int[Tensor, "B P"], Bool[Tensor, "B P"]]:
     """Indices of the first `slots` chosen candidates, in order, and which of them there are (the first ones).
 
@@ -103,7 +116,7 @@ def keep(
 
     Args:
         stays: propagated objects that are kept.
-        arrives: discovered cells that become objects. Those that find no slot are dropped.
+        arrives: discovered cells that become objects. Those that find no slot are dropped: see `admitted`.
         ids: of the propagated objects.
         next_id: per video.
     """
