@@ -1,7 +1,7 @@
 """Boxes: cell centres, discovered and proposed boxes, overlap, rejection (gswm.md sections 4 to 6).
 
 z_where = (s_x, s_y, t_x, t_y): size as a share of the image side, centre in [-1, 1]. Sizes are not bounded after
-discovery: propagation adds to them, so one may leave (0, 1).
+discovery: propagation adds to them, so one may leave (0, 1), unless `Motion.bounded`.
 """
 
 from __future__ import annotations

@@ -20,6 +20,9 @@ from apex_lab.nn.spatial_transformer import crop
 
 Size = Annotated[float, Field(ge=0)]
 
+SMALLEST, LARGEST = 0.02, 1.0
+"""Sizes of propagated boxes under `Motion.bounded`, as shares of the image side: 2.6 to 128 of 128 pixels."""
+
 
 @dataclass(frozen=True)
 class Motion:
@@ -32,6 +35,8 @@ class Motion:
         shift: largest change of a centre, in [-1, 1] coordinates.
         depth: what the change of z_depth is multiplied by; it has no bound.
         what: largest change of an entry of z_what.
+        bounded: keep the sizes of propagated boxes between `SMALLEST` and `LARGEST`, with no gradient beyond. As
+            published there is no bound: a size may pass through zero, by which pasting divides, and mirror its glimpse.
     """
 
     grow_min: Size = 0.1
@@ -40,6 +45,7 @@ class Motion:
     shift: Size = 0.6
     depth: Size = 1.0
     what: Size = 0.2
+    bounded: bool = False
 
 
 class Propagated(NamedTuple):
@@ -119,8 +125,11 @@ class Propagation(nn.Module):
         gate_depth, gate_where, gate_what = gates.split([DEPTH, WHERE, self.what], dim=-1)
         motion = self.motion
         step = torch.cat([motion.scale * torch.tanh(size), motion.shift * torch.tanh(shift)], dim=-1)
+        where = before.where + gate_where * step
+        if motion.bounded:
+            where = torch.cat([where[..., :2].clamp(SMALLEST, LARGEST), where[..., 2:]], dim=-1)
         return (
             before.depth + motion.depth * gate_depth * depth,
-            before.where + gate_where * step,
+            where,
             before.what + motion.what * gate_what * torch.tanh(what),
         )
