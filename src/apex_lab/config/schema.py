@@ -188,6 +188,7 @@ def check_job(
     refuse_missing(raw)
     if to_train:
         ablations.check(raw, choices, conf_dir())
+        ablations.check_original(choices)
     if needs_recipe and to_train:
         _check_recipe(config, choices)
     try:
