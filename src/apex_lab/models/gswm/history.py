@@ -200,15 +200,22 @@ class History(nn.Module):
         """The learned states that all new objects start from."""
         return Memory(*self.start[:, :, None, None].expand(-1, -1, batch, count, -1))
 
-    def surroundings(
-        self, where: Float[Tensor, "B M 4"], backdrop: Float[Tensor, "B 3 H W"]
-    ) -> Float[Tensor, "B M hidden"]:
-        """Codes of the background around boxes; both chains see the same."""
+    def scenery(self, backdrops: Float[Tensor, "B T 3 H W"]) -> Tensor:
+        """What `surroundings` reads of the background's images, before the loop over time: (B, T, ...).
+
+        Objects that see the whole image need its code alone, which depends on no frame before; else, the images.
+        """
+        if self.environment != "whole":
+            return backdrops
+        return self.encoder(backdrops.flatten(0, 1)).unflatten(0, backdrops.shape[:2])
+
+    def surroundings(self, where: Float[Tensor, "B M 4"], scenery: Tensor) -> Float[Tensor, "B M hidden"]:
+        """Codes of the background around boxes; both chains see the same. `scenery` (B, ...): that of the frame."""
         if self.environment == "none":
             return where.new_zeros(*where.shape[:2], self.hidden)
         if self.environment == "whole":
-            return self.encoder(backdrop)[:, None].expand(-1, where.shape[1], -1)
-        crops = crop(backdrop, window_of(enlarged(where, self.margin)), self.size)
+            return scenery[:, None].expand(-1, where.shape[1], -1)
+        crops = crop(scenery, window_of(enlarged(where, self.margin)), self.size)
         return self.encoder(crops.flatten(0, 1)).unflatten(0, crops.shape[:2])
 
     def forward(
@@ -217,13 +224,14 @@ class History(nn.Module):
         memory: Memory,
         source: Int[Tensor, "B M"],
         cells: int,
-        backdrop: Float[Tensor, "B 3 H W"],
+        scenery: Tensor,
         fused: Fused,
     ) -> tuple[Float[Tensor, "B M Z"], Memory]:
         """Takes the M objects at `source` out of N and advances their states.
 
         Discovered objects, the first `cells` of the N, interact with each other, and so do the tracked ones behind
-        them. All are partners, but the states of those that are not taken are needed no more.
+        them. All are partners, but the states of those that are not taken are needed no more. `scenery` is that of the
+        frame (see the method).
         """
         taken = take(z, source)
         hidden, cell = (take(state, source, dim=2) for state in memory)
@@ -234,7 +242,7 @@ class History(nn.Module):
         rows = torch.cat([taken.expand(CHAINS, *taken.shape), hidden], dim=-1)
         columns = torch.cat([z.expand(CHAINS, *z.shape), memory.hidden], dim=-1)
         acting = self.interaction(rows, columns, z[..., 0], together, source[..., None] == index, fused)
-        around = self.surroundings(taken[..., 2:6], backdrop)
+        around = self.surroundings(taken[..., 2:6], scenery)
         seen = torch.cat([rows[..., : z.shape[-1]], acting, around.expand_as(acting).to(acting.dtype)], dim=-1)
         return taken, self._advance(self.input(seen), Memory(hidden, cell))
 
