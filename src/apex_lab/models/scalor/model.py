@@ -19,6 +19,7 @@ from apex_lab.models.scalor.result import (
     BACKGROUND_ID,
     Frame,
     Readout,
+    Untracked,
     diagnostics,
     frame_masks,
     frame_means,
@@ -65,6 +66,8 @@ class Scalor(SceneModel):
         background_decoder: "weak" draws smooth backgrounds only, for data where the background explains everything.
         latents: in evaluation, "samples" as published, or "means", with presence = [probability > 1/2].
         readout: from the rendered layers to masks; see `result.frame_masks`.
+        untracked: in the masks, discoveries that are rendered but not carried on count as "background", or are
+            "dropped": see `result.frame_masks`.
         recompute: activations that are computed again in the backward pass instead of being kept: "nothing";
             "objects": of the glimpse decoder and the composition; "everything": of the glimpse encoder and the
             background too. Costs time for memory (README.md), changes no result.
@@ -97,12 +100,13 @@ class Scalor(SceneModel):
         background_decoder: DecoderKind = "strong",
         latents: Literal["samples", "means"] = "samples",
         readout: Readout = "rendering",
+        untracked: Untracked = "background",
         recompute: Level = "nothing",
     ) -> None:
         super().__init__()
         self.image_size, self.sigma = image_size, sigma
         self.input_size = (image_size, image_size)
-        self.latents, self.readout = latents, readout
+        self.latents, self.readout, self.untracked = latents, readout, untracked
         everything = Recompute(recompute == "everything")
         self.recompute = everything
         self.encoder = VideoEncoder(image_size, grid)
@@ -171,7 +175,13 @@ class Scalor(SceneModel):
         with full_precision(rendered.image):
             masks = torch.stack(
                 [
-                    frame_masks(frame, Layers(*(x[:, t] for x in layers)), rendered.foreground[:, t], self.readout)
+                    frame_masks(
+                        frame,
+                        Layers(*(x[:, t] for x in layers)),
+                        rendered.foreground[:, t],
+                        self.readout,
+                        self.untracked,
+                    )
                     for t, frame in enumerate(frames)
                 ],
                 dim=1,
