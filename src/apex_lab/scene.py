@@ -19,6 +19,9 @@ from torch import Tensor, nn
 ABSENT = -1
 """Identity of a component that holds nothing in a frame."""
 
+BACKGROUND_ID = 0
+"""Identity of the background where a model has one; its objects count from 1."""
+
 Schedule = Mapping[str, Tensor]
 """Values that depend on training progress (temperature, prior, ...), evaluated at one step: name -> 0-dim tensor."""
 

@@ -9,11 +9,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from apex_lab.models.gswm.boxes import cell_centres, discovered_box, gaussian_weight, rejected
-from apex_lab.models.gswm.latents import DEPTH, WHERE, Attributes, gaussian, precise, relaxed_bernoulli
+from apex_lab.models.gswm.boxes import discovered_box, gaussian_weight, rejected
+from apex_lab.models.gswm.latents import DEPTH, WHERE, Attributes, gaussian, relaxed_bernoulli
 from apex_lab.models.gswm.networks import cell_head
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.grid import cell_centres
+from apex_lab.nn.precision import full
 
 Draw = Literal["independent", "balanced"]
 
@@ -94,7 +96,7 @@ class Discovery(nn.Module):
         seen = torch.cat([features, tracked_map], dim=1)
         raw = self.attribute_head(seen).flatten(2).transpose(1, 2)
         raw_dyna = self.dyna_head(seen).flatten(2).transpose(1, 2)
-        prob = torch.sigmoid(precise(raw[..., 0]))
+        prob = torch.sigmoid(full(raw[..., 0]))
         pres = relaxed_bernoulli(prob, temperature, uniform)
         posterior = Posterior(prob, pres, raw[..., 1:], raw_dyna)
 

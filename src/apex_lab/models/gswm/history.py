@@ -15,11 +15,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from apex_lab.models.gswm.boxes import enlarged, window_of
-from apex_lab.models.gswm.latents import SHIFT, precise
+from apex_lab.models.gswm.boxes import enlarged
+from apex_lab.models.gswm.latents import SHIFT
 from apex_lab.models.gswm.networks import Encoder
-from apex_lab.models.gswm.slots import take
-from apex_lab.nn.spatial_transformer import crop
+from apex_lab.nn.precision import full
+from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.spatial_transformer import crop, window_of
 
 Environment = Literal["attention", "whole", "none"]
 
@@ -148,7 +149,7 @@ class Interaction(nn.Module):
         pairs = F.celu(of_row[:, :, :, None] + of_column[:, :, None], inplace=True)
         read = F.celu(torch.baddbmm(fused.second_bias, pairs.flatten(1, -2), fused.second), inplace=True)
         effects, scores = read.unflatten(1, pairs.shape[1:-1]).split(CHAINS)
-        logits = precise(self.logit_net.last(scores).squeeze(-1))
+        logits = full(self.logit_net.last(scores).squeeze(-1))
         if together is not None:
             logits = logits.masked_fill(~together, -torch.inf)
         weights = logits.softmax(-1) * presence[:, None]
@@ -233,8 +234,8 @@ class History(nn.Module):
         them. All are partners, but the states of those that are not taken are needed no more. `scenery` is that of the
         frame (see the method).
         """
-        taken = take(z, source)
-        hidden, cell = (take(state, source, dim=2) for state in memory)
+        taken = gather_slots(z, source)
+        hidden, cell = (gather_slots(state, source, dim=2) for state in memory)
         index = torch.arange(z.shape[1], device=z.device)
         together = None
         if cells < z.shape[1]:
@@ -249,6 +250,6 @@ class History(nn.Module):
     def _advance(self, x: Tensor, memory: Memory) -> Memory:
         """An LSTM cell per chain."""
         gates = self.from_input(x) + self.from_hidden(memory.hidden)
-        into, forget, new, out = precise(gates).chunk(4, dim=-1)
+        into, forget, new, out = full(gates).chunk(4, dim=-1)
         cell = torch.sigmoid(forget) * memory.cell + torch.sigmoid(into) * torch.tanh(new)
         return Memory(torch.sigmoid(out) * torch.tanh(cell), cell)

@@ -11,12 +11,13 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from apex_lab.models.gswm.boxes import enlarged, window_of
-from apex_lab.models.gswm.latents import DEPTH, WHERE, Attributes, gaussian, precise, relaxed_bernoulli
+from apex_lab.models.gswm.boxes import enlarged
+from apex_lab.models.gswm.latents import DEPTH, WHERE, Attributes, gaussian, relaxed_bernoulli
 from apex_lab.models.gswm.networks import Encoder
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian
-from apex_lab.nn.spatial_transformer import crop
+from apex_lab.nn.precision import full
+from apex_lab.nn.spatial_transformer import crop, window_of
 
 Size = Annotated[float, Field(ge=0)]
 
@@ -99,7 +100,7 @@ class Propagation(nn.Module):
         """Attributes at t - 1 and both states (posterior's, prior's) after it -> attributes at t."""
         q_hidden, p_hidden = hidden.unbind()
         low, high = self.motion.grow_min, self.motion.grow_max
-        proposal = enlarged(before.where, low + (high - low) * torch.sigmoid(precise(self.grow_net(q_hidden))))
+        proposal = enlarged(before.where, low + (high - low) * torch.sigmoid(full(self.grow_net(q_hidden))))
         crops = crop(image, window_of(proposal), self.glimpse)
         code = self.encoder(crops.flatten(0, 1)).unflatten(0, crops.shape[:2])
         raw_dyna = self.q_net(torch.cat([code, q_hidden.to(code.dtype)], dim=-1))
@@ -108,7 +109,7 @@ class Propagation(nn.Module):
         drawn_rest, drawn_dyna = noise.split([gaussians, noise.shape[-1] - gaussians], dim=-1)
         dyna = q_dyna.mean + q_dyna.std * drawn_dyna
 
-        chance, rest, gates = precise(self.change_net(dyna)).split([1, 2 * gaussians, gaussians], dim=-1)
+        chance, rest, gates = full(self.change_net(dyna)).split([1, 2 * gaussians, gaussians], dim=-1)
         prob = torch.sigmoid(chance[..., 0])
         parts = [gaussian(part) for part in rest.split([2 * DEPTH, 2 * WHERE, 2 * self.what], dim=-1)]
         mean, std = (torch.cat(values, dim=-1) for values in zip(*parts, strict=True))

@@ -8,12 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from apex_lab.models.gswm.boxes import window_of
 from apex_lab.models.gswm.latents import Attributes
 from apex_lab.models.gswm.rendering import Drawn
-from apex_lab.scene import ABSENT, Scene
+from apex_lab.nn.spatial_transformer import window_of
+from apex_lab.scene import ABSENT, BACKGROUND_ID, Scene
 
-BACKGROUND_ID = 0
 PRESENT = 0.5
 """Presence from which an object counts, in the published read-out too."""
 

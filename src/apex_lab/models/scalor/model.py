@@ -16,7 +16,6 @@ from apex_lab.models.scalor.latents import GUARD, full_precision
 from apex_lab.models.scalor.objective import Terms, added, discovery_terms, propagation_terms
 from apex_lab.models.scalor.recompute import Level, Recompute
 from apex_lab.models.scalor.result import (
-    BACKGROUND_ID,
     Frame,
     Readout,
     Untracked,
@@ -28,7 +27,7 @@ from apex_lab.models.scalor.result import (
 from apex_lab.models.scalor.rollout import ObjectNetworks, State, Step
 from apex_lab.models.scalor.windows import AnchoredSize, SizeRule
 from apex_lab.nn.distributions import kl_gaussian
-from apex_lab.scene import Context, Noise, Scene, SceneModel
+from apex_lab.scene import BACKGROUND_ID, Context, Noise, Scene, SceneModel
 
 Count = Annotated[int, Field(gt=0)]
 Share = Annotated[float, Field(gt=0, lt=1)]

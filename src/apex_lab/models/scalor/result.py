@@ -12,14 +12,13 @@ from torch import Tensor
 from apex_lab.models.scalor.composition import Layers, paster_of
 from apex_lab.models.scalor.latents import GUARD
 from apex_lab.models.scalor.rollout import Step, joined_candidates
-from apex_lab.models.scalor.windows import window_of
 from apex_lab.nn.precision import full
+from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.spatial_transformer import window_of
 from apex_lab.nn.splitting import part_size
 
 Readout = Literal["rendering", "overlay"]
 Untracked = Literal["background", "dropped"]
-
-BACKGROUND_ID = 0
 
 FAINT = 0.3
 """The original's overlay is shown where the foreground's mask is above this."""
@@ -27,10 +26,8 @@ FAINT = 0.3
 
 def held(step: Step, propagated: Tensor | None, found: Tensor) -> Tensor:
     """Values of the candidates that the P slots hold after the frame, (B, P, ...); zero where they hold nothing."""
-    values = joined_candidates(step, propagated, found)
-    kept = step.kept.reshape(*step.kept.shape, *([1] * (values.dim() - 2)))
-    source = step.source.reshape(*step.source.shape, *([1] * (values.dim() - 2)))
-    return values.gather(1, source.expand(-1, -1, *values.shape[2:])) * kept
+    values = gather_slots(joined_candidates(step, propagated, found), step.source)
+    return values * step.kept.reshape(*step.kept.shape, *([1] * (values.dim() - 2)))
 
 
 class Shapes(NamedTuple):

@@ -15,10 +15,12 @@ from apex_lab.models.scalor.glimpses import GlimpseDecoder, GlimpseEncoder
 from apex_lab.models.scalor.latents import Sampler, full_precision
 from apex_lab.models.scalor.propagation import Propagated, Propagation
 from apex_lab.models.scalor.recompute import Recompute
-from apex_lab.models.scalor.slots import FIRST_ID, Objects, Slots, admitted, carry, keep, pack, strongest, taken
-from apex_lab.models.scalor.windows import SizeRule, window_of
+from apex_lab.models.scalor.slots import FIRST_ID, Objects, Slots, admitted, carry, keep, pack, strongest
+from apex_lab.models.scalor.windows import SizeRule
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.precision import full
+from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.spatial_transformer import window_of
 from apex_lab.scene import ABSENT, Noise, Schedule
 
 CURRICULUM_ALPHA = 0.9
@@ -227,7 +229,7 @@ class ObjectNetworks(nn.Module):
             index, valid = (
                 x.unflatten(0, values.shape[:2]) for x in pack(present, min(self.max_objects, values.shape[2]))
             )
-            presence, others = taken(values, index).split([1, values.shape[-1] - 1], dim=-1)
+            presence, others = gather_slots(values, index, dim=2).split([1, values.shape[-1] - 1], dim=-1)
             values = torch.cat([presence * valid[..., None], others], dim=-1)
         curriculum = (schedule["alpha_curriculum"] > 0.5) & (index >= slots)
         counted = torch.where(curriculum, 0.0, 1.0)

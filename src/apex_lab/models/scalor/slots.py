@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from apex_lab.nn.slots import gather_slots
 from apex_lab.scene import ABSENT
 
 FIRST_ID = 1
@@ -136,11 +137,6 @@ def carry(candidates: tuple[Objects, Objects], kept: Kept, flow: Float[Tensor, "
     """
     sizes = [x.shape[-1] for x in candidates[0]]
     whole = torch.cat([torch.cat(group, dim=-1) for group in candidates], dim=1)
-    picked = taken(whole, kept.source) * kept.valid[..., None]
+    picked = gather_slots(whole, kept.source) * kept.valid[..., None]
     picked = torch.where(flow > 0.5, picked, picked.detach())
     return Objects(*picked.split(sizes, dim=-1))
-
-
-def taken(values: Float[Tensor, "*batch K D"], source: Int[Tensor, "*batch P"]) -> Float[Tensor, "*batch P D"]:
-    """Rows of `values` at `source`."""
-    return values.gather(-2, source[..., None].expand(*source.shape, values.shape[-1]))
