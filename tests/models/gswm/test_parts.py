@@ -331,7 +331,19 @@ def test_balanced_frames_that_discover() -> None:
     assert set(later.mask.sum(1).tolist()) == {2}
 
 
-@pytest.mark.parametrize("how", ["independent", "balanced"])
+def test_one_draw_for_the_whole_batch() -> None:
+    u = torch.rand(5, 2000, 2, generator=torch.Generator().manual_seed(0))
+    which = discovering(u, 0.3, "batch", first=True)
+    assert which.mask is not None
+    assert which.frames is None
+    assert which.mask[:, 0].all()
+    assert torch.equal(which.mask[:, 1:], (u[:1, 1:, 0] >= 0.3).expand(5, -1))
+    assert float(which.mask[0].float().mean()) == pytest.approx(0.7, abs=0.05)
+    assert tiny(norm="group", discovery_draw="batch").batch_statistics
+    assert not tiny(norm="group").batch_statistics
+
+
+@pytest.mark.parametrize("how", ["independent", "balanced", "batch"])
 def test_dropout_zero_discovers_always(how: str) -> None:
     u = torch.rand(5, 4, 2)
     assert discovering(u, 0.0, how, first=True).mask.all()  # type: ignore[arg-type, union-attr]

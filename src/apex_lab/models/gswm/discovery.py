@@ -17,7 +17,7 @@ from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.grid import cell_centres
 from apex_lab.nn.precision import full
 
-Draw = Literal["independent", "balanced"]
+Draw = Literal["independent", "balanced", "batch"]
 
 
 class Posterior(NamedTuple):
@@ -123,10 +123,10 @@ class Discovering(NamedTuple):
 def discovering(uniform: Float[Tensor, "B T 2"], dropout: float, how: Draw, first: bool) -> Discovering:
     """Draws the frames of training in which discovery runs. A video's first frame always discovers.
 
-    The published code draws once per frame for the whole batch; here every video draws for itself, so that its result
-    depends on no other. `independent`: every later frame discovers with probability 1 - dropout. `balanced`: so does
-    it here, but the number of such frames is the expected one (rounded down or up, at random), so that no more images
-    have to be encoded than may discover.
+    `independent`: every later frame discovers with probability 1 - dropout, and every video draws for itself, so that
+    its result depends on no other. `batch`: one draw per frame for the whole batch, that of its first video, as
+    published. `balanced`: every video for itself, but the number of such frames is the expected one (rounded down or
+    up, at random), so that no more images have to be encoded than may discover.
 
     Args:
         uniform: in [0, 1).
@@ -137,7 +137,9 @@ def discovering(uniform: Float[Tensor, "B T 2"], dropout: float, how: Draw, firs
     b = len(uniform)
     later = uniform[:, int(first) :, 0]
     always = torch.ones(b, int(first), dtype=torch.bool, device=uniform.device)
-    if how == "independent" or later.shape[1] == 0:
+    if how == "batch":
+        later = later[:1].expand(b, -1)
+    if how != "balanced" or later.shape[1] == 0:
         return Discovering(torch.cat([always, later >= dropout], dim=1), None)
     expected = later.shape[1] * (1 - dropout)
     sure, most = math.floor(expected + 1e-9), math.ceil(expected - 1e-9)

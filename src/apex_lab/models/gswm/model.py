@@ -95,7 +95,7 @@ class Gswm(SceneModel):
         rejection_iou: discovered objects that overlap a tracked one by more are rejected; null rejects none.
         scale_std: standard deviation of the prior of a discovered object's raw size.
         discovery_dropout: probability in training that a frame after the first does not discover.
-        discovery_draw: how these frames are drawn, `independent` or `balanced`: see `discovery.discovering`.
+        discovery_draw: how these frames are drawn, `independent`, `balanced` or `batch`: see `discovery.discovering`.
         evaluation: latents in evaluation: sampled, as published, or their means.
     """
 
@@ -161,7 +161,8 @@ class Gswm(SceneModel):
         side = image_size if environment == "whole" else glimpse_size
         self.history = History(1 + self.each, hidden, environment, environment_margin, side, glimpse_widths)
         self.renderer = Renderer(what, glimpse_size, glimpse_widths[::-1], image_size)
-        self.batch_statistics = any(isinstance(module, nn.BatchNorm2d) for module in self.modules())
+        normalises = any(isinstance(module, nn.BatchNorm2d) for module in self.modules())
+        self.batch_statistics = normalises or discovery_draw == "batch"  # a draw that shares of a batch would not share
 
     def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
         """Infers a video.

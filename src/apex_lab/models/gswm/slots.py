@@ -13,7 +13,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from apex_lab.nn.slots import gather_slots
+
 FIRST_ID = 1
+
+take = gather_slots
 
 
 class Kept(NamedTuple):
