@@ -97,6 +97,8 @@ class Gswm(SceneModel):
         discovery_dropout: probability in training that a frame after the first does not discover.
         discovery_draw: how these frames are drawn, `independent`, `balanced` or `batch`: see `discovery.discovering`.
         evaluation: latents in evaluation: sampled, as published, or their means.
+        unused_parameters: have the published model's parameters that nothing reads too, to compare counts; they are
+            zero and not trained.
     """
 
     term_names = (
@@ -140,6 +142,7 @@ class Gswm(SceneModel):
         discovery_dropout: Share = 0.5,
         discovery_draw: Draw = "independent",
         evaluation: Latents = "sample",
+        unused_parameters: bool = False,
     ) -> None:
         super().__init__()
         self.cells = image_encoder.grid**2
@@ -161,6 +164,9 @@ class Gswm(SceneModel):
         side = image_size if environment == "whole" else glimpse_size
         self.history = History(1 + self.each, hidden, environment, environment_margin, side, glimpse_widths)
         self.renderer = Renderer(what, glimpse_size, glimpse_widths[::-1], image_size)
+        if unused_parameters:
+            starts, head = torch.zeros(2, hidden), torch.zeros(2 * dyna, hidden + 1)  # discovery's old z_dyna outputs
+            self.unused = nn.ParameterList(nn.Parameter(x, requires_grad=False) for x in (starts, head))
         normalises = any(isinstance(module, nn.BatchNorm2d) for module in self.modules())
         self.batch_statistics = normalises or discovery_draw == "batch"  # a draw that shares of a batch would not share
 
