@@ -19,6 +19,9 @@ from torch import Tensor, nn
 ABSENT = -1
 """Identity of a component that holds nothing in a frame."""
 
+BACKGROUND_ID = 0
+"""Identity of the background where a model has one; its objects count from 1."""
+
 Schedule = Mapping[str, Tensor]
 """Values that depend on training progress (temperature, prior, ...), evaluated at one step: name -> 0-dim tensor."""
 
@@ -162,7 +165,7 @@ class SceneModel(nn.Module):
     """True for models whose likelihood is a mixture over components, so that `posterior` can be called."""
 
     batch_statistics: bool = False
-    """True for models that normalise over the batch in training, so that what a video gives depends on the others."""
+    """True for models that normalise over the batch in training, or draw for it: a result depends on other videos."""
 
     input_size: tuple[int, int] | None = None
     """(H, W) in pixels for a model built for one size: videos are resized to it, masks back. None: any size."""

@@ -117,3 +117,14 @@ def test_files_of_all_kinds(tmp_path: Path) -> None:
     assert refused("", {}) == ""
     ablations.check({}, {"ablation": "of_the_user"}, tmp_path)
     ablations.check({}, {}, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["gswm", "scalor", "space", "op3", "slot_attention"])
+@pytest.mark.parametrize("scale", ["cpu", "smoke"])
+def test_original_settings_stand_on_the_recipe_of_the_paper_s_scale(name: str, scale: str) -> None:
+    with pytest.raises(UserError) as refused:
+        compose_job(f"model={name}", "data=p2d", f"scale={scale}", f"+experiment={name}_original")
+    assert str(refused.value) == (
+        f"+experiment={name}_original changes the recipe of scale=paper, and this run has scale={scale}, whose sizes, "
+        f"steps and schedules are others: leave out scale={scale}, or the experiment."
+    )

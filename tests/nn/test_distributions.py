@@ -1,10 +1,20 @@
 """Closed forms against Monte Carlo and torch.distributions."""
 
+import math
+
 import pytest
 import torch
 from torch.distributions import Bernoulli, Normal, RelaxedBernoulli, kl_divergence
 
-from apex_lab.nn.distributions import Gaussian, gaussian_from, kl_bernoulli, kl_gaussian, relaxed_bernoulli
+from apex_lab.nn.distributions import (
+    LOG_GUARD,
+    Gaussian,
+    gaussian_from,
+    kl_bernoulli,
+    kl_gaussian,
+    relaxed_bernoulli,
+    relaxed_logit,
+)
 from apex_lab.scene import Noise
 
 
@@ -96,3 +106,20 @@ def test_kl_bernoulli_against_monte_carlo_in_both_directions() -> None:
         sampled = Bernoulli(q).log_prob(x) - Bernoulli(p).log_prob(x)
         assert (kl_bernoulli(q, p) - sampled.mean()).abs() < 5 * sampled.std() / len(x) ** 0.5
     assert kl_bernoulli(a, a) == 0
+
+
+def test_kl_bernoulli_with_a_guard_inside_the_logarithms() -> None:
+    """A prior of 1e-10 is kept as it is, where the clamp of the default makes it 1e-6."""
+    one, rare = torch.tensor(1.0), torch.tensor(1e-10)
+    assert float(kl_bernoulli(one, rare, added=LOG_GUARD)) == pytest.approx(10 * math.log(10), rel=1e-5)
+    assert float(kl_bernoulli(one, rare)) == pytest.approx(6 * math.log(10), rel=1e-3)
+    q, p = torch.tensor([0.0, 0.3, 1.0]), torch.tensor(0.2)
+    want = [-math.log(0.8), 0.3 * math.log(0.3 / 0.2) + 0.7 * math.log(0.7 / 0.8), -math.log(0.2)]
+    assert kl_bernoulli(q, p, added=LOG_GUARD).tolist() == pytest.approx(want, rel=1e-5)
+
+
+def test_relaxed_logit() -> None:
+    """(logit of the probability + logit of the uniform number) / temperature, with both kept from 0 and 1."""
+    prob, u = torch.tensor([0.3, 0.5, 0.0]), torch.tensor([0.5, 0.9, 1.0])
+    got = relaxed_logit(prob, torch.tensor(0.5), u, 0.01)
+    assert got.tolist() == pytest.approx([2 * math.log(0.3 / 0.7), 2 * math.log(9), 0.0], abs=1e-4)

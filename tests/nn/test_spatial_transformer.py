@@ -4,7 +4,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from apex_lab.nn.spatial_transformer import Paster, _triangle, crop, paste, pixel_centres
+from apex_lab.nn.spatial_transformer import Paster, _triangle, crop, for_paste, paste, pixel_centres, window_of
 
 
 def windows(n: int, generator: torch.Generator, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -98,3 +98,12 @@ def test_between_pixel_centres_the_gradient_of_the_weights_is_that_of_autograd()
     [found] = torch.autograd.grad((_triangle(position, 8) * weights).sum(), position)
     torch.testing.assert_close(found, wanted)
     assert wanted.count_nonzero() > 100
+
+
+def test_published_boxes_as_windows() -> None:
+    """x first there, y first here; a size of zero can be pasted through."""
+    window = window_of(torch.tensor([0.1, 0.2, 0.3, 0.4]))
+    assert window.tolist() == torch.tensor([0.2, 0.1, 0.4, 0.3]).tolist()
+    guarded = for_paste(torch.tensor([0.0, 0.0, 0.4, 0.3]))
+    assert guarded.tolist() == torch.tensor([1e-9, 1e-9, 0.4, 0.3]).tolist()
+    assert bool(paste(torch.ones(1, 1, 4, 4), guarded[None], 8).isfinite().all())

@@ -415,8 +415,9 @@ class Naive(nn.Module):
             return yes
         rate = self.settings["dropout"]
         for i in range(b):
-            draws = [float(uniform[k][i, -2]) for k in range(1, t)]
-            if self.settings["how"] == "independent":
+            drawer = 0 if self.settings["how"] == "batch" else i
+            draws = [float(uniform[k][drawer, -2]) for k in range(1, t)]
+            if self.settings["how"] != "balanced":
                 yes[i, 1:] = torch.tensor([u >= rate for u in draws])
                 continue
             expected = (1 - rate) * (t - 1)

@@ -378,11 +378,12 @@ class NaiveScalor(nn.Module):
             for k in range(old):
                 if float(stays[i, k]) > 0:
                     mine.append((k, int(state["ids"][i, k])))
-            for c in range(new["presence"].shape[1]):
-                if float(arrives[i, c]) > self.model.objects.track:
-                    mine.append((old + c, int(next_id[i])))
-                    next_id[i] += 1
-            kept.append(mine[:p_max])
+            cells = [c for c in range(new["presence"].shape[1]) if float(arrives[i, c]) > self.model.objects.track]
+            strongest = sorted(cells, key=lambda c: -float(arrives[i, c]))[: p_max - len(mine)]
+            for c in sorted(strongest):
+                mine.append((old + c, int(next_id[i])))
+                next_id[i] += 1
+            kept.append(mine)
         longest = max(len(mine) for mine in kept)
         after: dict[str, Tensor] = {}
         for name in names:

@@ -1,7 +1,8 @@
 """An ablation names a row of a table, so what its file sets must be in force in the run that bears its name.
 
 Words after it on the command line come later in the composition and can undo it: the run would fill the row with
-something else. Experiments are starting points, and their values may be changed.
+something else. Experiments are starting points, and their values may be changed; but those of an original publication
+change a recipe of the paper's scale, and nothing else.
 """
 
 from __future__ import annotations
@@ -51,6 +52,25 @@ def check(raw: Mapping[str, Any], choices: Mapping[str, str], conf: Path) -> Non
                 _compare(raw, name, key, value)
     for key, value in _values(file):
         _compare(raw, name, key, value)
+
+
+def check_original(choices: Mapping[str, str]) -> None:
+    """Refuses the experiment of an original publication on another recipe than that of the paper's scale.
+
+    Such a file changes what differs from that recipe alone: with another one, a run would be neither of the two.
+
+    Args:
+        choices: group -> word.
+
+    Raises:
+        UserError: the scale is another one.
+    """
+    name, scale = choices.get("experiment", ""), choices.get("scale")
+    if name.endswith("_original") and scale != "paper":
+        raise UserError(
+            f"+experiment={name} changes the recipe of scale=paper, and this run has scale={scale}, whose sizes, steps "
+            f"and schedules are others: leave out scale={scale}, or the experiment."
+        )
 
 
 def explain(sentence: str, choices: Mapping[str, str], conf: Path) -> None:

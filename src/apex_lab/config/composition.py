@@ -23,8 +23,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import did_you_mean, sentence, shown, to_open
-from apex_lab.config import initial, trust
+from apex_lab.config import initial, resolvers, trust
 from apex_lab.config.upgrades import fingerprint
+
+resolvers.register()
 
 CHOICES = ("model", "ablation", "data", "scale", "experiment", "tuned")
 """Groups that name a run; a run has one choice of each."""

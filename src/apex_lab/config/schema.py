@@ -188,6 +188,7 @@ def check_job(
     refuse_missing(raw)
     if to_train:
         ablations.check(raw, choices, conf_dir())
+        ablations.check_original(choices)
     if needs_recipe and to_train:
         _check_recipe(config, choices)
     try:
@@ -424,8 +425,8 @@ def _check_ranks(config: Config, model: SceneModel) -> None:
         )
     if model.batch_statistics:
         raise UserError(
-            f"trainer.devices x trainer.num_nodes = {ranks}, but this model normalises over the batch, and shares of a "
-            "batch have other statistics: set both to 1."
+            f"trainer.devices x trainer.num_nodes = {ranks}, but this model normalises over the batch, or draws "
+            "for it, which shares of a batch cannot do: set both to 1."
         )
     counts = [count for count in (config.data.get("val"), config.trainer.validation_videos) if isinstance(count, int)]
     if config.trainer.validation_interval is not None and counts and min(counts) < ranks:

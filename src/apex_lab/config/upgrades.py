@@ -19,6 +19,9 @@ FORMAT = 2
 ADDED: dict[str, Any] = {
     "trainer.cuda_graph": False,
     "init_from": None,
+    "model.motion.bounded": False,  # G-SWM
+    "model.unused_parameters": False,  # G-SWM
+    "model.untracked": "background",  # SCALOR
 }
 """Keys added since `FORMAT` was raised, with the value that they had before they existed."""
 

@@ -16,15 +16,17 @@ class ConvLSTM(nn.Module):
     Args:
         channels: of the feature map, in and out.
         kernel: side of both convolutions.
+        forget: bias of the forget gate at the start; None: drawn, as all biases of a convolution.
     """
 
-    def __init__(self, channels: int, kernel: int = 3) -> None:
+    def __init__(self, channels: int, kernel: int = 3, forget: float | None = 1.0) -> None:
         super().__init__()
         self.from_input = nn.Conv2d(channels, 4 * channels, kernel, padding=kernel // 2)
         self.from_hidden = nn.Conv2d(channels, 4 * channels, kernel, padding=kernel // 2, bias=False)
-        with torch.no_grad():  # start by remembering: forget gates half open would blur the first steps
-            assert self.from_input.bias is not None
-            self.from_input.bias[channels : 2 * channels] = 1.0
+        if forget is not None:  # start by remembering: forget gates half open would blur the first steps
+            with torch.no_grad():
+                assert self.from_input.bias is not None
+                self.from_input.bias[channels : 2 * channels] = forget
 
     def forward(
         self, features: Float[Tensor, "B T C h w"], state: tuple[Tensor, Tensor] | None = None

@@ -44,16 +44,41 @@ def kl_gaussian(a: Gaussian, b: Gaussian) -> Float[Tensor, "..."]:
     return 0.5 * (ratio + shift - 1 - ratio.log()).sum(-1)
 
 
-def kl_bernoulli(q: Float[Tensor, "..."], p: Float[Tensor, "..."], tiny: float = 1e-6) -> Float[Tensor, "..."]:
-    """KL(Bernoulli(q) || Bernoulli(p)) of probabilities, elementwise; nats. Probabilities are kept `tiny` from 0, 1."""
-    q, p = q.clamp(tiny, 1 - tiny), p.clamp(tiny, 1 - tiny)
-    return q * (q.log() - p.log()) + (1 - q) * ((-q).log1p() - (-p).log1p())
+LOG_GUARD = 1e-15
+"""What SCALOR, SPACE and G-SWM add inside every logarithm of the KL of a presence."""
+
+
+def kl_bernoulli(
+    q: Float[Tensor, "..."], p: Float[Tensor, "..."], tiny: float = 1e-6, added: float | None = None
+) -> Float[Tensor, "..."]:
+    """KL(Bernoulli(q) || Bernoulli(p)) of probabilities, elementwise; nats.
+
+    Args:
+        q, p: probabilities; `p` may be one number for all.
+        tiny: they are kept this far from 0 and 1.
+        added: in place of `tiny`, they stay as they are, and this is added inside every logarithm: for priors such as
+            1e-10, where 1 - p rounds to 1.
+    """
+    if added is None:
+        q, p = q.clamp(tiny, 1 - tiny), p.clamp(tiny, 1 - tiny)
+        return q * (q.log() - p.log()) + (1 - q) * ((-q).log1p() - (-p).log1p())
+    present = q * ((q + added).log() - (p + added).log())
+    return present + (1 - q) * ((1 - q + added).log() - (1 - p + added).log())
+
+
+def relaxed_logit(
+    prob: Float[Tensor, "..."], temperature: Tensor, uniform: Float[Tensor, "..."], tiny: float
+) -> Float[Tensor, "..."]:
+    """Reparameterised sample of the binary concrete distribution before its logistic function, from uniform numbers.
+
+    Probabilities and uniform numbers are kept `tiny` from 0 and 1. P(sample > 0) = prob.
+    """
+    prob, u = prob.clamp(tiny, 1 - tiny), uniform.clamp(tiny, 1 - tiny)
+    return (prob.log() - (-prob).log1p() + u.log() - (-u).log1p()) / temperature
 
 
 def relaxed_bernoulli(
     prob: Float[Tensor, "..."], temperature: Tensor, noise: Noise, tiny: float = 1e-6
 ) -> Float[Tensor, "..."]:
     """Reparameterised sample of the binary Gumbel-softmax (concrete) distribution with P(z > 0.5) = prob."""
-    prob = prob.clamp(tiny, 1 - tiny)
-    u = noise.uniform(prob).clamp(tiny, 1 - tiny)
-    return torch.sigmoid((prob.log() - (-prob).log1p() + u.log() - (-u).log1p()) / temperature)
+    return torch.sigmoid(relaxed_logit(prob, temperature, noise.uniform(prob), tiny))

@@ -14,6 +14,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+PASTE_GUARD = 1e-9
+"""Added to the sizes of windows that are pasted through: a paste divides by them, and they may be zero."""
+
+
+def window_of(where: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """z_where as it is published, x first, (s_x, s_y, t_x, t_y) -> a window."""
+    return where.unflatten(-1, (2, 2)).flip(-1).flatten(-2)
+
+
+def for_paste(windows: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
+    """Windows whose sizes are guarded against zero, as published by SCALOR, SPACE and G-SWM."""
+    size, centre = windows.split(2, dim=-1)
+    return torch.cat([size + PASTE_GUARD, centre], dim=-1)
+
 
 def pixel_centres(n: int, like: Tensor) -> Float[Tensor, " n"]:
     """Centres of `n` pixels on the axis [-1, 1]."""

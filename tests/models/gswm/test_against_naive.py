@@ -78,9 +78,10 @@ def test_gradients() -> None:
                 torch.testing.assert_close(layer.weight.grad[chain].T, linear.weight.grad, rtol=1e-6, atol=1e-6 * scale)
 
 
-def test_balanced_discovery() -> None:
-    """With statistics of its own for each image, since it encodes other ones together than the twin does."""
-    model = tiny(discovery_draw="balanced")
+@pytest.mark.parametrize("draw", ["balanced", "batch"])
+def test_other_draws_of_the_frames_that_discover(draw: Any) -> None:
+    """With statistics of its own for each image: `balanced` encodes other ones together than the twin does."""
+    model = tiny(discovery_draw=draw)
     twin = Naive(model)
     for net in (model, twin):
         for part in (part for part in net.modules() if isinstance(part, nn.BatchNorm2d)):

@@ -141,6 +141,23 @@ def test_gradients_reach_all_parameters(environment: Any, draw: Any) -> None:
         assert parameter.grad.any(), name
 
 
+@pytest.mark.parametrize("background", [True, False])
+def test_the_state_of_a_training_pass_holds_no_graph(background: bool) -> None:
+    state = tiny(background=background).train()(video(2, 3), context((0, 1))).state
+    tensors = [*(state.background or ()), state.slots.z, *state.slots.memory, state.slots.ids, state.slots.next_id]
+    assert [x.requires_grad for x in tensors] == [False] * len(tensors)
+
+
+@pytest.mark.parametrize(("environment", "passes"), [("whole", 1), ("attention", 5), ("none", 0)])
+def test_a_whole_background_is_encoded_once_for_all_frames(environment: Any, passes: int) -> None:
+    model, seen = tiny(environment=environment), []
+    if environment != "none":
+        model.history.encoder.register_forward_hook(lambda net, inputs, output: seen.append(len(inputs[0])))
+    model(video(3, 5), context())
+    assert len(seen) == passes
+    assert sum(seen) == {"whole": 3 * 5, "attention": 3 * 5 * 4, "none": 0}[environment]
+
+
 def test_without_gradients() -> None:
     model = tiny().eval()
     with torch.no_grad():

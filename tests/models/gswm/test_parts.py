@@ -15,7 +15,8 @@ from apex_lab.models.gswm.latents import Attributes, attributes, draw, gaussian,
 from apex_lab.models.gswm.networks import conv_stack, shuffle_stack
 from apex_lab.models.gswm.objective import where_prior
 from apex_lab.models.gswm.propagation import Motion, Propagation
-from apex_lab.models.gswm.rendering import compose, negative_log_likelihood
+from apex_lab.models.gswm.rendering import Drawn, compose, negative_log_likelihood
+from apex_lab.models.gswm.result import scene_of
 from apex_lab.models.gswm.slots import keep, take
 from apex_lab.nn.noise import VideoNoise
 from apex_lab.scene import Noise
@@ -88,6 +89,32 @@ def test_what_motion_does() -> None:
     s, t = 0.3 * 0.25 * tanh, 0.6 * 0.25 * tanh
     torch.testing.assert_close(where, torch.tensor([[[2 + s, 3 + s, 4 + t, 5 + t]]]))
     torch.testing.assert_close(what, torch.tensor([[[6.0, 7.0, 8.0]]]) + 0.2 * 0.25 * tanh)
+
+
+@pytest.mark.parametrize(
+    ("bounded", "sizes"),
+    [(False, [0.1 - 0.3 * 0.5, 0.9 + 0.3 * 0.5]), (True, [0.02, 1.0])],
+    ids=["published", "bounded"],
+)
+def test_sizes_leave_their_range_unless_they_are_bounded(bounded: bool, sizes: list[float]) -> None:
+    """Gates of a half, and changes beyond any tanh: by -0.15 and by +0.15. Centres are free either way."""
+    net = small_propagation(Motion(scale=0.3, shift=0.6, bounded=bounded))
+    z = torch.zeros(1, 1, 13)
+    z[..., 2:6] = torch.tensor([0.1, 0.9, -0.9, 0.9])
+    change = torch.zeros(1, 1, 8)
+    change[..., 1:5] = torch.tensor([-50.0, 50.0, -50.0, 50.0])
+    _, where, _ = net.moved(attributes(z, 3), change, torch.full((1, 1, 8), 0.5))
+    torch.testing.assert_close(where[0, 0], torch.tensor([*sizes, -1.2, 1.2]))
+
+
+def test_windows_of_mirrored_glimpses_have_positive_sizes() -> None:
+    objects = attributes(torch.tensor([0.9, 0.0, -0.3, 0.2, 0.5, -0.5, *[0.0] * 7]).expand(1, 1, 1, 13), 3)
+    drawn = Drawn(torch.zeros(1, 1, 4, 4), torch.zeros(1, 3, 4, 4), torch.zeros(1, 1, 3, 4, 4))
+    ids, tracked = torch.ones(1, 1, 1, dtype=torch.long), torch.ones(1, 1, 1, dtype=torch.bool)
+    scene = scene_of(objects, ids, tracked, drawn, torch.zeros(1, 1, 3, 4, 4), {}, None, detail=True)
+    assert scene.windows is not None
+    torch.testing.assert_close(scene.windows[0, 0, 0], torch.tensor([0.2, 0.3, -0.5, 0.5]))  # y first
+    assert float(scene.diagnostics["window_size"]) == pytest.approx(0.25)
 
 
 def test_presence_only_decays_and_the_proposal_is_larger(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -304,7 +331,19 @@ def test_balanced_frames_that_discover() -> None:
     assert set(later.mask.sum(1).tolist()) == {2}
 
 
-@pytest.mark.parametrize("how", ["independent", "balanced"])
+def test_one_draw_for_the_whole_batch() -> None:
+    u = torch.rand(5, 2000, 2, generator=torch.Generator().manual_seed(0))
+    which = discovering(u, 0.3, "batch", first=True)
+    assert which.mask is not None
+    assert which.frames is None
+    assert which.mask[:, 0].all()
+    assert torch.equal(which.mask[:, 1:], (u[:1, 1:, 0] >= 0.3).expand(5, -1))
+    assert float(which.mask[0].float().mean()) == pytest.approx(0.7, abs=0.05)
+    assert tiny(norm="group", discovery_draw="batch").batch_statistics
+    assert not tiny(norm="group").batch_statistics
+
+
+@pytest.mark.parametrize("how", ["independent", "balanced", "batch"])
 def test_dropout_zero_discovers_always(how: str) -> None:
     u = torch.rand(5, 4, 2)
     assert discovering(u, 0.0, how, first=True).mask.all()  # type: ignore[arg-type, union-attr]

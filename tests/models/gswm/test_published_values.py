@@ -118,6 +118,17 @@ def test_parameters(size: int, grid: int, glimpse: int, published: int) -> None:
 
 
 @pytest.mark.parametrize(
+    ("size", "unused", "total"),
+    [(128, True, 12_777_723), (128, False, 12_744_443), (64, True, 8_839_419), (64, False, 8_806_139)],
+)
+def test_parameters_with_those_that_nothing_reads(size: int, unused: bool, total: int) -> None:
+    model = Gswm(size, ImageEncoder(size), Background(size), Motion(), unused_parameters=unused)
+    assert count(model) == total
+    trained = sum(p.numel() for p in model.parameters() if p.requires_grad)
+    assert trained == {128: 12_744_443, 64: 8_806_139}[size]
+
+
+@pytest.mark.parametrize(
     ("environment", "published"), [("attention", 8_320_587), ("whole", 8_566_347), ("none", 8_566_347 - 360_192)]
 )
 def test_parameters_of_the_maze_model(environment: str, published: int) -> None:

@@ -60,8 +60,10 @@ def test_same_terms_masks_and_gradients(arguments: dict[str, Any], schedule: dic
         torch.testing.assert_close(ours[name], gradient, rtol=0, atol=5e-3 * scale, msg=named(name))
 
 
-def test_same_in_evaluation() -> None:
-    model = small(evaluation_objects=20).eval()
+@pytest.mark.parametrize("slots", [20, 3])
+def test_same_in_evaluation(slots: int) -> None:
+    """With 3 slots, more cells are discovered than find one."""
+    model = small(evaluation_objects=slots).eval()
     video = clip(2, 4)
     with torch.no_grad():
         got, want = run(model, video), twin(model, video)
@@ -69,4 +71,7 @@ def test_same_in_evaluation() -> None:
         torch.testing.assert_close(got.terms[name], want.terms[name], rtol=1e-4, atol=1e-2, msg=named(name))
     for i, row in enumerate(want.masks):
         for t, frame in enumerate(row):
-            assert sorted(k for k in got.ids[i, t].tolist() if k >= 0) == sorted(frame)
+            ids = got.ids[i, t].tolist()
+            assert sorted(k for k in ids if k >= 0) == sorted(frame)
+            for name, mask in frame.items():
+                torch.testing.assert_close(got.masks[i, t, ids.index(name)], mask, rtol=0, atol=1e-3)

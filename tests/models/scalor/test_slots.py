@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from apex_lab.models.scalor.slots import Objects, carry, keep, pack, strongest
+from apex_lab.models.scalor.slots import Objects, admitted, carry, keep, pack, strongest
 
 YES, NO = True, False
 
@@ -49,6 +49,32 @@ def test_arrivals_without_a_slot_are_dropped() -> None:
     kept = keep(torch.tensor([[YES, YES]]), torch.tensor([[YES, YES]]), torch.tensor([[1, 2]]), torch.tensor([3]))
     assert kept.ids.tolist() == [[1, 2]]
     assert kept.source.tolist() == [[0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("free", "want"),
+    [
+        (0, [NO, NO, NO, NO, NO]),
+        (1, [NO, NO, YES, NO, NO]),
+        (2, [YES, NO, YES, NO, NO]),  # the first of two equally strong ones
+        (3, [YES, NO, YES, YES, NO]),
+        (9, [YES, NO, YES, YES, YES]),
+    ],
+)
+def test_the_strongest_arrivals_find_a_slot(free: int, want: list[bool]) -> None:
+    """0.95 does not arrive (it may be rejected); one of 0.71 stands behind stronger ones."""
+    arrives, presence = torch.tensor([[YES, NO, YES, YES, YES]]), torch.tensor([[0.8, 0.95, 0.9, 0.8, 0.71]])
+    assert admitted(arrives, presence, torch.tensor([free]))[0].tolist() == want
+
+
+def test_the_strongest_arrivals_are_packed_row_by_row() -> None:
+    """Two of four slots are free, three cells arrive, the first of them is the weakest."""
+    stays, arrives = torch.tensor([[YES, NO, YES, NO]]), torch.tensor([[YES, YES, NO, YES]])
+    arrives = admitted(arrives, torch.tensor([[0.71, 0.8, 0.1, 0.9]]), torch.tensor([2]))
+    kept = keep(stays, arrives, torch.tensor([[1, 2, 3, -1]]), torch.tensor([4]))
+    assert kept.source.tolist() == [[0, 2, 5, 7]]
+    assert kept.ids.tolist() == [[1, 3, 4, 5]]
+    assert kept.next_id.tolist() == [6]
 
 
 def objects(count: int, offset: float) -> Objects:

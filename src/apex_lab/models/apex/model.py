@@ -29,10 +29,11 @@ from apex_lab.models.apex.objects import (
 )
 from apex_lab.models.apex.result import Drawn, Picture, scene_of, video_of
 from apex_lab.models.apex.rollout import Frame, Memory, State, Step, frames_of, stack_steps
-from apex_lab.models.apex.slots import carry, gather_slots
+from apex_lab.models.apex.slots import carry
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
 from apex_lab.nn.distributions import kl_gaussian
+from apex_lab.nn.slots import gather_slots
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import Context, Noise, Scene, SceneModel, Schedule, Statistics

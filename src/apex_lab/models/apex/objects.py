@@ -13,10 +13,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from apex_lab.models.apex.glimpses import Glimpses
-from apex_lab.models.apex.slots import gather_slots
 from apex_lab.models.apex.windows import Windows, square_of, window_of
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian, gaussian_from, relaxed_bernoulli
+from apex_lab.nn.slots import gather_slots
 from apex_lab.scene import Noise
 
 NARROW = -3.0

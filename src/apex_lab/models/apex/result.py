@@ -10,12 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from apex_lab.models.apex.rollout import State, Step
-from apex_lab.models.apex.slots import gather_slots
 from apex_lab.models.apex.windows import window_of
+from apex_lab.nn.slots import gather_slots
 from apex_lab.nn.splitting import joined
-from apex_lab.scene import Scene
-
-BACKGROUND_ID = 0
+from apex_lab.scene import BACKGROUND_ID, Scene
 
 
 class Drawn(NamedTuple):

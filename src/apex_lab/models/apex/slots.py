@@ -11,6 +11,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from apex_lab.nn.slots import gather_slots as gather_slots
+
 
 class Carried(NamedTuple):
     """What the P slots hold after filtering.
@@ -62,9 +64,3 @@ def carry(
     source = torch.where(fills, slots + picked, torch.arange(slots, device=ids.device).expand_as(ids))
     new_ids = torch.where(fills, next_id[:, None] + rank, torch.where(stays, ids, torch.full_like(ids, -1)))
     return Carried(source, stays | fills, new_ids, next_id + arrivals)
-
-
-def gather_slots(values: Tensor, source: Int[Tensor, "B S"]) -> Tensor:
-    """values (B, K, ...) taken at `source` along K -> (B, S, ...)."""
-    index = source.reshape(*source.shape, *([1] * (values.dim() - 2))).expand(*source.shape, *values.shape[2:])
-    return values.gather(1, index)

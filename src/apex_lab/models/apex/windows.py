@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.nn.spatial_transformer import pixel_centres
+from apex_lab.nn.grid import cell_centres
 
 MAX_LOGIT = 4.0
 """Bound of the size logit: windows between 1.8 % and 98.2 % of the image side, so gradients through 1/s stay finite."""
@@ -54,9 +54,7 @@ class Windows(nn.Module):
 
     def __init__(self, grid: int, reach: float, size_step: float, centre_step: float) -> None:
         super().__init__()
-        axis = pixel_centres(grid, torch.zeros(()))
-        cells = torch.stack(torch.meshgrid(axis, axis, indexing="ij"), dim=-1).reshape(-1, 2)
-        self.register_buffer("cells", cells, persistent=False)
+        self.register_buffer("cells", cell_centres(grid).flip(-1), persistent=False)  # (y, x)
         self.reach = reach * 2 / grid
         self.size_step, self.centre_step = size_step, centre_step
 

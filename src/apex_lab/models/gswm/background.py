@@ -10,10 +10,11 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from apex_lab.models.gswm.latents import gaussian, precise
+from apex_lab.models.gswm.latents import gaussian
 from apex_lab.models.gswm.networks import Decoder, Encoder
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import kl_gaussian
+from apex_lab.nn.precision import full
 
 Count = Annotated[int, Field(gt=0)]
 
@@ -93,5 +94,5 @@ class Background(nn.Module):
         after, (p_hidden, p_cell) = self.p_lstm(z, start)
         before = torch.cat([state.p_hidden[:, None], after[:, :-1]], dim=1)
         kl = kl_gaussian(gaussian(torch.stack(raws, dim=1)), gaussian(self.p_net(before)))
-        images = precise(self.decoder(z.flatten(0, 1))).unflatten(0, (b, t))
+        images = full(self.decoder(z.flatten(0, 1))).unflatten(0, (b, t))
         return Backdrop(images, kl, BackgroundState(q_hidden, q_cell, p_hidden[0], p_cell[0]))

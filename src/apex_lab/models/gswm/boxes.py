@@ -1,7 +1,7 @@
 """Boxes: cell centres, discovered and proposed boxes, overlap, rejection (gswm.md sections 4 to 6).
 
 z_where = (s_x, s_y, t_x, t_y): size as a share of the image side, centre in [-1, 1]. Sizes are not bounded after
-discovery: propagation adds to them, so one may leave (0, 1).
+discovery: propagation adds to them, so one may leave (0, 1), unless `Motion.bounded`.
 """
 
 from __future__ import annotations
@@ -12,17 +12,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from apex_lab.nn.spatial_transformer import pixel_centres
+from apex_lab.nn.grid import cell_centres as cell_centres
+from apex_lab.nn.spatial_transformer import for_paste, window_of
 
-PASTE_GUARD = 1e-9
 OVERLAP_GUARD = 1e-5
-
-
-def cell_centres(grid: int) -> Float[Tensor, "D 2"]:
-    """Centres (x, y) of the G^2 cells, row-major, in [-1, 1]."""
-    axis = pixel_centres(grid, torch.zeros(()))
-    y, x = torch.meshgrid(axis, axis, indexing="ij")
-    return torch.stack([x, y], dim=-1).reshape(-1, 2)
 
 
 def discovered_box(raw: Float[Tensor, "... D 4"], centres: Float[Tensor, "D 2"]) -> Float[Tensor, "... D 4"]:
@@ -38,14 +31,9 @@ def enlarged(where: Float[Tensor, "... 4"], by: Float[Tensor, "... 2"] | float) 
     return torch.cat([size + by, shift], dim=-1)
 
 
-def window_of(where: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
-    """z_where -> window (s_y, s_x, t_y, t_x) of `apex_lab.nn.spatial_transformer`."""
-    return where.unflatten(-1, (2, 2)).flip(-1).flatten(-2)
-
-
 def paste_window(where: Float[Tensor, "... 4"]) -> Float[Tensor, "... 4"]:
     """z_where -> window of a paste, which divides by the size: guarded as published."""
-    return window_of(enlarged(where, PASTE_GUARD))
+    return for_paste(window_of(where))
 
 
 def gaussian_weight(offset: Float[Tensor, "... 2"], sigma: float) -> Float[Tensor, "..."]:

@@ -9,13 +9,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from apex_lab.models.gswm.boxes import cell_centres, discovered_box, gaussian_weight, rejected
-from apex_lab.models.gswm.latents import DEPTH, WHERE, Attributes, gaussian, precise, relaxed_bernoulli
+from apex_lab.models.gswm.boxes import discovered_box, gaussian_weight, rejected
+from apex_lab.models.gswm.latents import DEPTH, WHERE, Attributes, gaussian, relaxed_bernoulli
 from apex_lab.models.gswm.networks import cell_head
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.grid import cell_centres
+from apex_lab.nn.precision import full
 
-Draw = Literal["independent", "balanced"]
+Draw = Literal["independent", "balanced", "batch"]
 
 
 class Posterior(NamedTuple):
@@ -94,7 +96,7 @@ class Discovery(nn.Module):
         seen = torch.cat([features, tracked_map], dim=1)
         raw = self.attribute_head(seen).flatten(2).transpose(1, 2)
         raw_dyna = self.dyna_head(seen).flatten(2).transpose(1, 2)
-        prob = torch.sigmoid(precise(raw[..., 0]))
+        prob = torch.sigmoid(full(raw[..., 0]))
         pres = relaxed_bernoulli(prob, temperature, uniform)
         posterior = Posterior(prob, pres, raw[..., 1:], raw_dyna)
 
@@ -121,10 +123,10 @@ class Discovering(NamedTuple):
 def discovering(uniform: Float[Tensor, "B T 2"], dropout: float, how: Draw, first: bool) -> Discovering:
     """Draws the frames of training in which discovery runs. A video's first frame always discovers.
 
-    The published code draws once per frame for the whole batch; here every video draws for itself, so that its result
-    depends on no other. `independent`: every later frame discovers with probability 1 - dropout. `balanced`: so does
-    it here, but the number of such frames is the expected one (rounded down or up, at random), so that no more images
-    have to be encoded than may discover.
+    `independent`: every later frame discovers with probability 1 - dropout, and every video draws for itself, so that
+    its result depends on no other. `batch`: one draw per frame for the whole batch, that of its first video, as
+    published. `balanced`: every video for itself, but the number of such frames is the expected one (rounded down or
+    up, at random), so that no more images have to be encoded than may discover.
 
     Args:
         uniform: in [0, 1).
@@ -135,7 +137,9 @@ def discovering(uniform: Float[Tensor, "B T 2"], dropout: float, how: Draw, firs
     b = len(uniform)
     later = uniform[:, int(first) :, 0]
     always = torch.ones(b, int(first), dtype=torch.bool, device=uniform.device)
-    if how == "independent" or later.shape[1] == 0:
+    if how == "batch":
+        later = later[:1].expand(b, -1)
+    if how != "balanced" or later.shape[1] == 0:
         return Discovering(torch.cat([always, later >= dropout], dim=1), None)
     expected = later.shape[1] * (1 - dropout)
     sure, most = math.floor(expected + 1e-9), math.ceil(expected - 1e-9)

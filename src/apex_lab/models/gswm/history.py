@@ -15,11 +15,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from apex_lab.models.gswm.boxes import enlarged, window_of
-from apex_lab.models.gswm.latents import SHIFT, precise
+from apex_lab.models.gswm.boxes import enlarged
+from apex_lab.models.gswm.latents import SHIFT
 from apex_lab.models.gswm.networks import Encoder
-from apex_lab.models.gswm.slots import take
-from apex_lab.nn.spatial_transformer import crop
+from apex_lab.nn.precision import full
+from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.spatial_transformer import crop, window_of
 
 Environment = Literal["attention", "whole", "none"]
 
@@ -148,7 +149,7 @@ class Interaction(nn.Module):
         pairs = F.celu(of_row[:, :, :, None] + of_column[:, :, None], inplace=True)
         read = F.celu(torch.baddbmm(fused.second_bias, pairs.flatten(1, -2), fused.second), inplace=True)
         effects, scores = read.unflatten(1, pairs.shape[1:-1]).split(CHAINS)
-        logits = precise(self.logit_net.last(scores).squeeze(-1))
+        logits = full(self.logit_net.last(scores).squeeze(-1))
         if together is not None:
             logits = logits.masked_fill(~together, -torch.inf)
         weights = logits.softmax(-1) * presence[:, None]
@@ -200,15 +201,22 @@ class History(nn.Module):
         """The learned states that all new objects start from."""
         return Memory(*self.start[:, :, None, None].expand(-1, -1, batch, count, -1))
 
-    def surroundings(
-        self, where: Float[Tensor, "B M 4"], backdrop: Float[Tensor, "B 3 H W"]
-    ) -> Float[Tensor, "B M hidden"]:
-        """Codes of the background around boxes; both chains see the same."""
+    def scenery(self, backdrops: Float[Tensor, "B T 3 H W"]) -> Tensor:
+        """What `surroundings` reads of the background's images, before the loop over time: (B, T, ...).
+
+        Objects that see the whole image need its code alone, which depends on no frame before; else, the images.
+        """
+        if self.environment != "whole":
+            return backdrops
+        return self.encoder(backdrops.flatten(0, 1)).unflatten(0, backdrops.shape[:2])
+
+    def surroundings(self, where: Float[Tensor, "B M 4"], scenery: Tensor) -> Float[Tensor, "B M hidden"]:
+        """Codes of the background around boxes; both chains see the same. `scenery` (B, ...): that of the frame."""
         if self.environment == "none":
             return where.new_zeros(*where.shape[:2], self.hidden)
         if self.environment == "whole":
-            return self.encoder(backdrop)[:, None].expand(-1, where.shape[1], -1)
-        crops = crop(backdrop, window_of(enlarged(where, self.margin)), self.size)
+            return scenery[:, None].expand(-1, where.shape[1], -1)
+        crops = crop(scenery, window_of(enlarged(where, self.margin)), self.size)
         return self.encoder(crops.flatten(0, 1)).unflatten(0, crops.shape[:2])
 
     def forward(
@@ -217,16 +225,17 @@ class History(nn.Module):
         memory: Memory,
         source: Int[Tensor, "B M"],
         cells: int,
-        backdrop: Float[Tensor, "B 3 H W"],
+        scenery: Tensor,
         fused: Fused,
     ) -> tuple[Float[Tensor, "B M Z"], Memory]:
         """Takes the M objects at `source` out of N and advances their states.
 
         Discovered objects, the first `cells` of the N, interact with each other, and so do the tracked ones behind
-        them. All are partners, but the states of those that are not taken are needed no more.
+        them. All are partners, but the states of those that are not taken are needed no more. `scenery` is that of the
+        frame (see the method).
         """
-        taken = take(z, source)
-        hidden, cell = (take(state, source, dim=2) for state in memory)
+        taken = gather_slots(z, source)
+        hidden, cell = (gather_slots(state, source, dim=2) for state in memory)
         index = torch.arange(z.shape[1], device=z.device)
         together = None
         if cells < z.shape[1]:
@@ -234,13 +243,13 @@ class History(nn.Module):
         rows = torch.cat([taken.expand(CHAINS, *taken.shape), hidden], dim=-1)
         columns = torch.cat([z.expand(CHAINS, *z.shape), memory.hidden], dim=-1)
         acting = self.interaction(rows, columns, z[..., 0], together, source[..., None] == index, fused)
-        around = self.surroundings(taken[..., 2:6], backdrop)
+        around = self.surroundings(taken[..., 2:6], scenery)
         seen = torch.cat([rows[..., : z.shape[-1]], acting, around.expand_as(acting).to(acting.dtype)], dim=-1)
         return taken, self._advance(self.input(seen), Memory(hidden, cell))
 
     def _advance(self, x: Tensor, memory: Memory) -> Memory:
         """An LSTM cell per chain."""
         gates = self.from_input(x) + self.from_hidden(memory.hidden)
-        into, forget, new, out = precise(gates).chunk(4, dim=-1)
+        into, forget, new, out = full(gates).chunk(4, dim=-1)
         cell = torch.sigmoid(forget) * memory.cell + torch.sigmoid(into) * torch.tanh(new)
         return Memory(torch.sigmoid(out) * torch.tanh(cell), cell)

@@ -11,9 +11,9 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from apex_lab.models.gswm.latents import precise
 from apex_lab.models.gswm.networks import norm
 from apex_lab.nn.layout import for_convolutions
+from apex_lab.nn.precision import full
 from apex_lab.nn.splitting import joined, part_size
 
 Count = Annotated[int, Field(gt=0)]
@@ -123,4 +123,4 @@ class ImageEncoder(nn.Module):
         x = F.relu(_normed(self.norm, x, frames), inplace=True)
         for stage in self.stages:
             x = stage(x, frames)
-        return precise(self.head(x)).unflatten(0, images.shape[:2])
+        return full(self.head(x)).unflatten(0, images.shape[:2])

@@ -13,14 +13,13 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn import distributions
+from apex_lab.nn.distributions import LOG_GUARD, Gaussian, relaxed_logit
+from apex_lab.nn.precision import full
 from apex_lab.scene import Noise
 
 MIN_STD = 1e-4
 """Added to the softplus of every raw standard deviation."""
-
-GUARD = 1e-15
-"""Keeps the logarithms of the Bernoulli KL finite."""
 
 DEPTH, WHERE = 1, 4
 """Lengths of z_depth and z_where."""
@@ -50,14 +49,9 @@ def attributes(z: Float[Tensor, "... Z"], what: int) -> Attributes:
     return Attributes(*z.split([1, DEPTH, WHERE, what, z.shape[-1] - 1 - DEPTH - WHERE - what], dim=-1))
 
 
-def precise(x: Tensor) -> Tensor:
-    """At least single precision: networks may run in a shorter type, latents and losses do not."""
-    return x.to(torch.promote_types(x.dtype, torch.float32))
-
-
 def gaussian(raw: Float[Tensor, "... two_D"]) -> Gaussian:
     """A network's output -> mean and standard deviation, softplus(raw) + 1e-4."""
-    mean, spread = precise(raw).chunk(2, dim=-1)
+    mean, spread = full(raw).chunk(2, dim=-1)
     return Gaussian(mean, F.softplus(spread) + MIN_STD)
 
 
@@ -66,15 +60,13 @@ def relaxed_bernoulli(
 ) -> Float[Tensor, "..."]:
     """Sample of the binary concrete distribution from uniform numbers; probabilities and numbers stay in (0, 1)."""
     info = torch.finfo(prob.dtype)
-    prob, uniform = prob.clamp(info.eps, 1 - info.eps), uniform.clamp(info.eps, 1 - info.eps)
-    logit = prob.log() - (-prob).log1p() + uniform.log() - (-uniform).log1p()
-    return torch.sigmoid(logit / temperature).clamp(info.tiny, 1 - info.eps)
+    logit = relaxed_logit(prob, temperature, uniform, info.eps)
+    return torch.sigmoid(logit).clamp(info.tiny, 1 - info.eps)
 
 
 def kl_bernoulli(q: Float[Tensor, "*shape"], p: Float[Tensor, ""]) -> Float[Tensor, "*shape"]:
-    """KL(Bernoulli(q) || Bernoulli(p)) of probabilities, elementwise; nats."""
-    present = q * ((q + GUARD).log() - (p + GUARD).log())
-    return present + (1 - q) * ((1 - q + GUARD).log() - (1 - p + GUARD).log())
+    """KL(Bernoulli(q) || Bernoulli(p)) of probabilities, elementwise; nats. 1e-15 inside every logarithm."""
+    return distributions.kl_bernoulli(q, p, added=LOG_GUARD)
 
 
 class Draws(NamedTuple):

@@ -43,15 +43,23 @@ class State(NamedTuple):
     slots: Slots
 
 
+def detached(state: State) -> State:
+    """The next chunk's gradients stop at its start, and the graph of this one can be freed."""
+    background = None if state.background is None else BackgroundState(*(x.detach() for x in state.background))
+    slots = state.slots
+    memory = Memory(*(x.detach() for x in slots.memory))
+    return State(background, slots._replace(z=slots.z.detach(), memory=memory))
+
+
 class Frame(NamedTuple):
     """What the loop over time reads of one frame.
 
-    image, backdrop (B, 3, H, W): RGB in [0, 1]. features (B, F, G, G): of the cells. draws: random numbers.
-    discovers (B,): videos that may discover; None: all.
+    image (B, 3, H, W): RGB in [0, 1]. scenery (B, ...): what objects see of the background, `History.scenery`.
+    features (B, F, G, G): of the cells. draws: random numbers. discovers (B,): videos that may discover; None: all.
     """
 
     image: Tensor
-    backdrop: Tensor
+    scenery: Tensor
     features: Tensor
     draws: Draws
     discovers: Tensor | None
@@ -87,8 +95,10 @@ class Gswm(SceneModel):
         rejection_iou: discovered objects that overlap a tracked one by more are rejected; null rejects none.
         scale_std: standard deviation of the prior of a discovered object's raw size.
         discovery_dropout: probability in training that a frame after the first does not discover.
-        discovery_draw: how these frames are drawn, `independent` or `balanced`: see `discovery.discovering`.
+        discovery_draw: how these frames are drawn, `independent`, `balanced` or `batch`: see `discovery.discovering`.
         evaluation: latents in evaluation: sampled, as published, or their means.
+        unused_parameters: have the published model's parameters that nothing reads too, to compare counts; they are
+            zero and not trained.
     """
 
     term_names = (
@@ -132,6 +142,7 @@ class Gswm(SceneModel):
         discovery_dropout: Share = 0.5,
         discovery_draw: Draw = "independent",
         evaluation: Latents = "sample",
+        unused_parameters: bool = False,
     ) -> None:
         super().__init__()
         self.cells = image_encoder.grid**2
@@ -153,7 +164,11 @@ class Gswm(SceneModel):
         side = image_size if environment == "whole" else glimpse_size
         self.history = History(1 + self.each, hidden, environment, environment_margin, side, glimpse_widths)
         self.renderer = Renderer(what, glimpse_size, glimpse_widths[::-1], image_size)
-        self.batch_statistics = any(isinstance(module, nn.BatchNorm2d) for module in self.modules())
+        if unused_parameters:
+            starts, head = torch.zeros(2, hidden), torch.zeros(2 * dyna, hidden + 1)  # discovery's old z_dyna outputs
+            self.unused = nn.ParameterList(nn.Parameter(x, requires_grad=False) for x in (starts, head))
+        normalises = any(isinstance(module, nn.BatchNorm2d) for module in self.modules())
+        self.batch_statistics = normalises or discovery_draw == "batch"  # a draw that shares of a batch would not share
 
     def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
         """Infers a video.
@@ -181,7 +196,7 @@ class Gswm(SceneModel):
             dropout, how = self.discovery_dropout, self.discovery_draw
             which = discovering(draws.discover, dropout, how, first=state is None)
         features = self._features(video, backdrop.images, which)
-        frames = frames_of(video, backdrop.images, features, draws, which)
+        frames = frames_of(video, self.history.scenery(backdrop.images), features, draws, which)
         steps, slots = self._roll_out(frames, None if state is None else state.slots, context.schedule)
         return self._explain(video, backdrop, which, steps, slots, context)
 
@@ -233,7 +248,7 @@ class Gswm(SceneModel):
             memory = Memory(*(torch.cat(states, dim=2) for states in zip(memory, before.memory, strict=True)))
             ids, next_id, pres = before.ids, before.next_id, tracked.pres[..., 0]
         kept = keep(found.pres[..., 0], pres, ids, next_id, self.max_objects, frame.discovers)
-        z, memory = self.history(z, memory, kept.source, self.cells, frame.backdrop, fused)
+        z, memory = self.history(z, memory, kept.source, self.cells, frame.scenery, fused)
         step = Step(z, kept.ids, kept.source, posterior, propagated)
         return step, Slots(z, memory, kept.ids, next_id + self.cells)
 
@@ -277,7 +292,7 @@ class Gswm(SceneModel):
             drawn,
             backdrop.images,
             terms,
-            State(backdrop.state, slots),
+            detached(State(backdrop.state, slots)),
             context.detail,
         )
 
@@ -290,9 +305,9 @@ class BlackBackdrop(NamedTuple):
     state: None
 
 
-def frames_of(video: Tensor, backdrops: Tensor, features: Tensor, draws: Draws, which: Discovering) -> list[Frame]:
+def frames_of(video: Tensor, scenery: Tensor, features: Tensor, draws: Draws, which: Discovering) -> list[Frame]:
     """Video -> frames: takes dimension 1 of everything apart, at once, as autograd likes it."""
     discovers = [None] * video.shape[1] if which.mask is None else list(which.mask.unbind(1))
     of_frames = [Draws(*values) for values in zip(*(x.unbind(1) for x in draws), strict=True)]
-    tensors = zip(video.unbind(1), backdrops.unbind(1), features.unbind(1), of_frames, discovers, strict=True)
+    tensors = zip(video.unbind(1), scenery.unbind(1), features.unbind(1), of_frames, discovers, strict=True)
     return [Frame(*values) for values in tensors]

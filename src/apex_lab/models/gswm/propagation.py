@@ -11,14 +11,18 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor, nn
 
-from apex_lab.models.gswm.boxes import enlarged, window_of
-from apex_lab.models.gswm.latents import DEPTH, WHERE, Attributes, gaussian, precise, relaxed_bernoulli
+from apex_lab.models.gswm.boxes import enlarged
+from apex_lab.models.gswm.latents import DEPTH, WHERE, Attributes, gaussian, relaxed_bernoulli
 from apex_lab.models.gswm.networks import Encoder
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian
-from apex_lab.nn.spatial_transformer import crop
+from apex_lab.nn.precision import full
+from apex_lab.nn.spatial_transformer import crop, window_of
 
 Size = Annotated[float, Field(ge=0)]
+
+SMALLEST, LARGEST = 0.02, 1.0
+"""Sizes of propagated boxes under `Motion.bounded`, as shares of the image side: 2.6 to 128 of 128 pixels."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,8 @@ class Motion:
         shift: largest change of a centre, in [-1, 1] coordinates.
         depth: what the change of z_depth is multiplied by; it has no bound.
         what: largest change of an entry of z_what.
+        bounded: keep the sizes of propagated boxes between `SMALLEST` and `LARGEST`, with no gradient beyond. As
+            published there is no bound: a size may pass through zero, by which pasting divides, and mirror its glimpse.
     """
 
     grow_min: Size = 0.1
@@ -40,6 +46,7 @@ class Motion:
     shift: Size = 0.6
     depth: Size = 1.0
     what: Size = 0.2
+    bounded: bool = False
 
 
 class Propagated(NamedTuple):
@@ -93,7 +100,7 @@ class Propagation(nn.Module):
         """Attributes at t - 1 and both states (posterior's, prior's) after it -> attributes at t."""
         q_hidden, p_hidden = hidden.unbind()
         low, high = self.motion.grow_min, self.motion.grow_max
-        proposal = enlarged(before.where, low + (high - low) * torch.sigmoid(precise(self.grow_net(q_hidden))))
+        proposal = enlarged(before.where, low + (high - low) * torch.sigmoid(full(self.grow_net(q_hidden))))
         crops = crop(image, window_of(proposal), self.glimpse)
         code = self.encoder(crops.flatten(0, 1)).unflatten(0, crops.shape[:2])
         raw_dyna = self.q_net(torch.cat([code, q_hidden.to(code.dtype)], dim=-1))
@@ -102,7 +109,7 @@ class Propagation(nn.Module):
         drawn_rest, drawn_dyna = noise.split([gaussians, noise.shape[-1] - gaussians], dim=-1)
         dyna = q_dyna.mean + q_dyna.std * drawn_dyna
 
-        chance, rest, gates = precise(self.change_net(dyna)).split([1, 2 * gaussians, gaussians], dim=-1)
+        chance, rest, gates = full(self.change_net(dyna)).split([1, 2 * gaussians, gaussians], dim=-1)
         prob = torch.sigmoid(chance[..., 0])
         parts = [gaussian(part) for part in rest.split([2 * DEPTH, 2 * WHERE, 2 * self.what], dim=-1)]
         mean, std = (torch.cat(values, dim=-1) for values in zip(*parts, strict=True))
@@ -119,8 +126,11 @@ class Propagation(nn.Module):
         gate_depth, gate_where, gate_what = gates.split([DEPTH, WHERE, self.what], dim=-1)
         motion = self.motion
         step = torch.cat([motion.scale * torch.tanh(size), motion.shift * torch.tanh(shift)], dim=-1)
+        where = before.where + gate_where * step
+        if motion.bounded:
+            where = torch.cat([where[..., :2].clamp(SMALLEST, LARGEST), where[..., 2:]], dim=-1)
         return (
             before.depth + motion.depth * gate_depth * depth,
-            before.where + gate_where * step,
+            where,
             before.what + motion.what * gate_what * torch.tanh(what),
         )

@@ -12,8 +12,9 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from apex_lab.models.gswm.boxes import paste_window
-from apex_lab.models.gswm.latents import Attributes, precise
+from apex_lab.models.gswm.latents import Attributes
 from apex_lab.models.gswm.networks import Decoder
+from apex_lab.nn.precision import full
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.nn.splitting import joined, part_size
 
@@ -105,7 +106,7 @@ class Renderer(nn.Module):
         return Drawn(joined(masks), joined(reconstruction), joined(means) if detail else None)
 
     def _part(self, objects: Attributes, backdrop: Tensor, detail: bool, fixed_alpha: Tensor | None) -> Drawn:
-        glimpses = precise(self.decoder(objects.what.flatten(0, 1))).unflatten(0, objects.what.shape[:2])
+        glimpses = full(self.decoder(objects.what.flatten(0, 1))).unflatten(0, objects.what.shape[:2])
         colour, alpha = glimpses.split([3, 1], dim=2)
         if fixed_alpha is not None:
             alpha = torch.where(fixed_alpha > 0, fixed_alpha, alpha)

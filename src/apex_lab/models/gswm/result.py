@@ -8,12 +8,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from apex_lab.models.gswm.boxes import window_of
 from apex_lab.models.gswm.latents import Attributes
 from apex_lab.models.gswm.rendering import Drawn
-from apex_lab.scene import ABSENT, Scene
+from apex_lab.nn.spatial_transformer import window_of
+from apex_lab.scene import ABSENT, BACKGROUND_ID, Scene
 
-BACKGROUND_ID = 0
 PRESENT = 0.5
 """Presence from which an object counts, in the published read-out too."""
 
@@ -35,9 +34,11 @@ def scene_of(
     b, t, slots = ids.shape
     masks = drawn.masks.unflatten(0, (b, t))
     presence = objects.pres[..., 0]
+    size, centre = objects.where.split(2, dim=-1)
+    box = torch.cat([size.abs(), centre], dim=-1)  # a negative size is a mirrored glimpse in a box of that size
     windows = means = None
     if detail:
-        windows = window_of(objects.where)
+        windows = window_of(box)
         windows = torch.cat([windows, torch.full_like(windows[:, :, :1], torch.nan)], dim=2)
         assert drawn.means is not None
         means = torch.cat([drawn.means.unflatten(0, (b, t)), backdrops[:, :, None]], dim=2)
@@ -48,7 +49,7 @@ def scene_of(
             "live_objects": live.sum(-1).mean(),
             "presence": presence.mean(),
             "foreground": masks.sum(2).mean(),
-            "window_size": (live * objects.where[..., :2].mean(-1)).sum() / count,
+            "window_size": (live * box[..., :2].mean(-1)).sum() / count,
             "tracked_share": (live * tracked).sum() / count,
         }
     return Scene(

@@ -13,7 +13,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from apex_lab.nn.slots import gather_slots
+
 FIRST_ID = 1
+
+take = gather_slots
 
 
 class Kept(NamedTuple):
@@ -56,12 +60,3 @@ def keep(
     fresh = best.gather(1, rank)
     own = torch.arange(d, d + slots, device=ids.device)
     return Kept(torch.where(stays, own, fresh), torch.where(stays, ids, next_id[:, None] + fresh))
-
-
-def take(values: Tensor, source: Int[Tensor, "B M"], dim: int = 1) -> Tensor:
-    """Values whose objects lie along `dim`, the dimension after the videos', at `source` -> M objects."""
-    shape = [1] * values.dim()
-    shape[dim - 1], shape[dim] = source.shape
-    size = list(values.shape)
-    size[dim] = source.shape[1]
-    return values.gather(dim, source.view(shape).expand(size))

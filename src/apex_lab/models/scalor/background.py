@@ -8,9 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, laid_out, same
+from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, same
 from apex_lab.models.scalor.latents import gaussian_of
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.precision import full
 from apex_lab.nn.splitting import joined, part_size
 
@@ -95,7 +96,7 @@ class Background(nn.Module):
         """q(z_bg) of frames, given A; gradients go through A to the objects."""
         seen = torch.cat([images, 1 - foreground[:, None]], dim=1)
         size = part_size(len(seen), 16 * (seen.shape[-1] // 2) ** 2, seen)
-        return gaussian_of(joined(self.encoder(laid_out(part)) for part in seen.split(size)).flatten(1))
+        return gaussian_of(joined(self.encoder(for_convolutions(part)) for part in seen.split(size)).flatten(1))
 
     def draw(self, latent: Float[Tensor, "N Z"]) -> Float[Tensor, "N 3 H W"]:
         """RGB in [0, 1]."""

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor, nn
+
+from apex_lab.nn.layout import for_convolutions
 
 GROUPS = {8: 4, 16: 4, 32: 8, 64: 8, 128: 16, 256: 16}
 """Groups of a GroupNorm by channels; the few layers that differ say so."""
-
-
-def laid_out(x: Tensor) -> Tensor:
-    """Channels last on a CPU, where convolutions of few channels run faster that way; unchanged elsewhere."""
-    return x.contiguous(memory_format=torch.channels_last) if x.device.type == "cpu" else x
 
 
 class SubPixel(nn.PixelShuffle):
     """PixelShuffle, laid out for the layers that follow."""
 
     def forward(self, x: Tensor) -> Tensor:
-        return laid_out(super().forward(x))
+        return for_convolutions(super().forward(x))
 
 
 def _normalised(channels: int, groups: int | None) -> list[nn.Module]:

@@ -11,11 +11,8 @@ from torch import Tensor
 
 from apex_lab.models.scalor.latents import GUARD, full_precision
 from apex_lab.nn.precision import full
-from apex_lab.nn.spatial_transformer import Paster
+from apex_lab.nn.spatial_transformer import Paster, for_paste
 from apex_lab.nn.splitting import joined, part_size
-
-SCALE_GUARD = 1e-9
-"""Added to a box's size where it is divided by."""
 
 
 class Layers(NamedTuple):
@@ -36,8 +33,7 @@ class Layers(NamedTuple):
 
 def paster_of(windows: Float[Tensor, "*batch 4"], glimpse: int, size: int) -> Paster:
     """Pastes through windows (s_y, s_x, t_y, t_x) that may have a size of zero."""
-    scale, centre = full(windows).split(2, dim=-1)
-    return Paster(torch.cat([scale + SCALE_GUARD, centre], dim=-1), glimpse, size)
+    return Paster(for_paste(full(windows)), glimpse, size)
 
 
 def layers_of(

@@ -8,15 +8,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from apex_lab.models.scalor.blocks import halved, halvings, laid_out, same
+from apex_lab.models.scalor.blocks import halved, halvings, same
 from apex_lab.models.scalor.composition import paster_of
 from apex_lab.models.scalor.encoder import FEATURES
 from apex_lab.models.scalor.glimpses import GlimpseEncoder
 from apex_lab.models.scalor.latents import GUARD, Sampler, bounded_logit, full_precision, gaussian_of
 from apex_lab.models.scalor.recompute import Recompute
-from apex_lab.models.scalor.windows import SizeRule, discovered, window_of
+from apex_lab.models.scalor.windows import SizeRule, discovered
 from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.precision import full
+from apex_lab.nn.spatial_transformer import window_of
 from apex_lab.nn.splitting import part_size
 
 MASK_CODE = 32
@@ -96,7 +98,7 @@ class Discovery(nn.Module):
         recompute: Recompute,
     ) -> Proposals:
         """Proposals of all cells; no gradient goes to `explained`."""
-        code = self.mask_encoder(laid_out(explained.detach()[:, None]))
+        code = self.mask_encoder(for_convolutions(explained.detach()[:, None]))
         q = self.fusion(torch.cat([features, code], dim=1))
 
         def cells(head: nn.Module) -> Float[Tensor, "B D outputs"]:
@@ -152,5 +154,5 @@ class Rejection:
 
 
 def room(valid: Bool[Tensor, "B P"], limit: int) -> Int[Tensor, " B"]:
-    """How many new objects a video may have in a frame, given the slots that came into it; at least 0."""
+    """How many new objects a video may have in a frame, given the slots that hold one already; at least 0."""
     return (limit - valid.sum(1)).clamp_min(0)

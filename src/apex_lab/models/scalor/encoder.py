@@ -6,7 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.models.scalor.blocks import halved, halvings, laid_out, same
+from apex_lab.models.scalor.blocks import halved, halvings, same
+from apex_lab.nn.conv_lstm import ConvLSTM
+from apex_lab.nn.layout import for_convolutions
 
 FEATURES = 64
 """Channels of e_t."""
@@ -47,11 +49,11 @@ class ImageEncoder(nn.Module):
         self.fuse = nn.Sequential(*same(2 * FEATURES, FEATURES))
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 64 G G"]:
-        u = self.stack(laid_out(images))
+        u = self.stack(for_convolutions(images))
         return self.fuse(torch.cat([u, self.lateral(u)], dim=1))
 
 
-class PeepholeConvLSTM(nn.Module):
+class PeepholeConvLSTM(ConvLSTM):
     """One ConvLSTM layer with peepholes; the output gate looks at the cell before its update, as published.
 
     Args:
@@ -60,29 +62,12 @@ class PeepholeConvLSTM(nn.Module):
     """
 
     def __init__(self, channels: int, grid: int) -> None:
-        super().__init__()
-        self.from_input = nn.Conv2d(channels, 4 * channels, 3, padding=1)
-        self.from_hidden = nn.Conv2d(channels, 4 * channels, 3, padding=1, bias=False)
+        super().__init__(channels, forget=None)
         self.peephole = nn.Parameter(torch.zeros(3, channels, grid, grid))  # W_i, W_f, W_o
-
-    def forward(
-        self, features: Float[Tensor, "B T C G G"], state: tuple[Tensor, Tensor] | None
-    ) -> tuple[Float[Tensor, "B T C G G"], tuple[Tensor, Tensor]]:
-        """Hidden states of all frames, and the state after the last; a state of None is zero."""
-        b, t = features.shape[:2]
-        # Not part of the recurrence: the convolution over the inputs of all frames at once.
-        driven = self.from_input(features.flatten(0, 1)).unflatten(0, (b, t))
-        hidden, cell = state or (torch.zeros_like(features[:, 0]), torch.zeros_like(features[:, 0]))
-        states = []
-        for frame in driven.unbind(1):
-            hidden, cell = self.step(frame, hidden, cell)
-            states.append(hidden)
-        return torch.stack(states, dim=1), (hidden, cell)
 
     def step(
         self, driven: Float[Tensor, "B C4 G G"], hidden: Float[Tensor, "B C G G"], cell: Float[Tensor, "B C G G"]
     ) -> tuple[Float[Tensor, "B C G G"], Float[Tensor, "B C G G"]]:
-        """One frame: `from_input` of its features and the state before it -> the state after it."""
         gates, candidate = (driven + self.from_hidden(hidden)).split([3 * cell.shape[1], cell.shape[1]], dim=1)
         peeped = gates.unflatten(1, (3, -1)) + cell[:, None] * self.peephole
         into, forget, out = torch.sigmoid(peeped).unbind(1)

@@ -9,8 +9,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, laid_out, same
+from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, same
 from apex_lab.models.scalor.latents import full_precision
+from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.spatial_transformer import crop
 from apex_lab.nn.splitting import joined, part_size
 
@@ -55,7 +56,7 @@ class GlimpseEncoder(nn.Module):
 
     def encode(self, glimpses: Float[Tensor, "N 3 g g"]) -> Float[Tensor, "N two_Z"]:
         """Means, then raw standard deviations."""
-        return self.head(self.stack(laid_out(glimpses)).flatten(1))
+        return self.head(self.stack(for_convolutions(glimpses)).flatten(1))
 
     def _cut(self, images: Tensor, windows: Tensor) -> Float[Tensor, "BK 3 g g"]:
         with full_precision(images):

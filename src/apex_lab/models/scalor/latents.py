@@ -7,7 +7,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn import distributions
+from apex_lab.nn.distributions import LOG_GUARD, Gaussian, kl_bernoulli
 from apex_lab.nn.precision import full
 from apex_lab.scene import Noise
 
@@ -18,7 +19,7 @@ UNIT = 1.1920929e-07
 """How far uniform numbers and probabilities are kept from 0 and 1: float32's spacing at 1."""
 
 GUARD = 1e-15
-"""Added inside logarithms and to denominators."""
+"""Added to denominators, and how far masks stay from 0 and 1."""
 
 TINY_STD = 1e-12
 """Floor of standard deviations; the original has none, and softplus underflows to zero in float32 below -104."""
@@ -44,21 +45,19 @@ def relaxed_logit(
     logit: Float[Tensor, "..."], temperature: Float[Tensor, ""], uniform: Float[Tensor, "..."]
 ) -> Float[Tensor, "..."]:
     """Sample of the relaxed Bernoulli before its logistic function, from uniform numbers."""
-    u = uniform.clamp(UNIT, 1 - UNIT)
-    prob = torch.sigmoid(logit).clamp(UNIT, 1 - UNIT)
-    return (prob.log() - (-prob).log1p() + u.log() - (-u).log1p()) / temperature
+    return distributions.relaxed_logit(torch.sigmoid(logit), temperature, uniform, UNIT)
 
 
 def kl_presence(logit: Float[Tensor, "..."], prior: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     """KL(Bernoulli(sigmoid(logit)) || Bernoulli(prior)), elementwise; nats. 1e-15 inside every logarithm."""
-    q = torch.sigmoid(logit)
-    yes = q * ((q + GUARD).log() - (prior + GUARD).log())
-    no = (1 - q) * ((1 - q + GUARD).log() - (1 - prior + GUARD).log())
-    return yes + no
+    return kl_bernoulli(torch.sigmoid(logit), prior, added=LOG_GUARD)
 
 
 def kl_standard(q: Gaussian) -> Float[Tensor, "..."]:
-    """KL(q || N(0, 1)), summed over the last dimension; nats."""
+    """KL(q || N(0, 1)), summed over the last dimension; nats.
+
+    `kl_gaussian` squares before it takes the logarithm, which rounds otherwise: trained runs would not repeat with it.
+    """
     return 0.5 * (q.mean.square() + q.std.square() - 1 - 2 * q.std.log()).sum(-1)
 
 

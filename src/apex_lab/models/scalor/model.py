@@ -16,9 +16,9 @@ from apex_lab.models.scalor.latents import GUARD, full_precision
 from apex_lab.models.scalor.objective import Terms, added, discovery_terms, propagation_terms
 from apex_lab.models.scalor.recompute import Level, Recompute
 from apex_lab.models.scalor.result import (
-    BACKGROUND_ID,
     Frame,
     Readout,
+    Untracked,
     diagnostics,
     frame_masks,
     frame_means,
@@ -27,7 +27,7 @@ from apex_lab.models.scalor.result import (
 from apex_lab.models.scalor.rollout import ObjectNetworks, State, Step
 from apex_lab.models.scalor.windows import AnchoredSize, SizeRule
 from apex_lab.nn.distributions import kl_gaussian
-from apex_lab.scene import Context, Noise, Scene, SceneModel
+from apex_lab.scene import BACKGROUND_ID, Context, Noise, Scene, SceneModel
 
 Count = Annotated[int, Field(gt=0)]
 Share = Annotated[float, Field(gt=0, lt=1)]
@@ -58,13 +58,15 @@ class Scalor(SceneModel):
         sigma: standard deviation of a pixel's likelihood.
         max_objects: P, objects that a video can carry. In training, the weakest discoveries beyond it are cut off and
             not rendered either, as published.
-        evaluation_objects: P in evaluation, where discoveries that find no slot are rendered, but not carried on;
-            null: as `max_objects`. The original sets no limit.
+        evaluation_objects: P in evaluation, where the weakest discoveries that find no slot are rendered, but not
+            carried on; null: as `max_objects`. The original sets no limit.
         track: a discovery with a presence above this is carried on.
         stop: an object whose absence, summed over its life, reaches this is deleted.
         background_decoder: "weak" draws smooth backgrounds only, for data where the background explains everything.
         latents: in evaluation, "samples" as published, or "means", with presence = [probability > 1/2].
         readout: from the rendered layers to masks; see `result.frame_masks`.
+        untracked: in the masks, discoveries that are rendered but not carried on count as "background", or are
+            "dropped": see `result.frame_masks`.
         recompute: activations that are computed again in the backward pass instead of being kept: "nothing";
             "objects": of the glimpse decoder and the composition; "everything": of the glimpse encoder and the
             background too. Costs time for memory (README.md), changes no result.
@@ -97,12 +99,13 @@ class Scalor(SceneModel):
         background_decoder: DecoderKind = "strong",
         latents: Literal["samples", "means"] = "samples",
         readout: Readout = "rendering",
+        untracked: Untracked = "background",
         recompute: Level = "nothing",
     ) -> None:
         super().__init__()
         self.image_size, self.sigma = image_size, sigma
         self.input_size = (image_size, image_size)
-        self.latents, self.readout = latents, readout
+        self.latents, self.readout, self.untracked = latents, readout, untracked
         everything = Recompute(recompute == "everything")
         self.recompute = everything
         self.encoder = VideoEncoder(image_size, grid)
@@ -171,7 +174,13 @@ class Scalor(SceneModel):
         with full_precision(rendered.image):
             masks = torch.stack(
                 [
-                    frame_masks(frame, Layers(*(x[:, t] for x in layers)), rendered.foreground[:, t], self.readout)
+                    frame_masks(
+                        frame,
+                        Layers(*(x[:, t] for x in layers)),
+                        rendered.foreground[:, t],
+                        self.readout,
+                        self.untracked,
+                    )
                     for t, frame in enumerate(frames)
                 ],
                 dim=1,

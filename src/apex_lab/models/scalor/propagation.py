@@ -15,11 +15,11 @@ from apex_lab.models.scalor.glimpses import GlimpseEncoder
 from apex_lab.models.scalor.latents import Sampler, bounded_logit, full_precision, gaussian_of
 from apex_lab.models.scalor.recompute import Recompute
 from apex_lab.models.scalor.slots import Objects
-from apex_lab.models.scalor.windows import SizeRule, propagated, window_of
+from apex_lab.models.scalor.windows import SizeRule, propagated
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.precision import full
-from apex_lab.nn.spatial_transformer import crop
+from apex_lab.nn.spatial_transformer import crop, window_of
 
 PRESENT_AT_FIRST = 2.0
 """Added to the raw presence logit: objects stay."""

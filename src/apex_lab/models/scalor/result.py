@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -11,13 +12,13 @@ from torch import Tensor
 from apex_lab.models.scalor.composition import Layers, paster_of
 from apex_lab.models.scalor.latents import GUARD
 from apex_lab.models.scalor.rollout import Step, joined_candidates
-from apex_lab.models.scalor.windows import window_of
 from apex_lab.nn.precision import full
+from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.spatial_transformer import window_of
 from apex_lab.nn.splitting import part_size
 
 Readout = Literal["rendering", "overlay"]
-
-BACKGROUND_ID = 0
+Untracked = Literal["background", "dropped"]
 
 FAINT = 0.3
 """The original's overlay is shown where the foreground's mask is above this."""
@@ -25,10 +26,25 @@ FAINT = 0.3
 
 def held(step: Step, propagated: Tensor | None, found: Tensor) -> Tensor:
     """Values of the candidates that the P slots hold after the frame, (B, P, ...); zero where they hold nothing."""
-    values = joined_candidates(step, propagated, found)
-    kept = step.kept.reshape(*step.kept.shape, *([1] * (values.dim() - 2)))
-    source = step.source.reshape(*step.source.shape, *([1] * (values.dim() - 2)))
-    return values.gather(1, source.expand(-1, -1, *values.shape[2:])) * kept
+    values = gather_slots(joined_candidates(step, propagated, found), step.source)
+    return values * step.kept.reshape(*step.kept.shape, *([1] * (values.dim() - 2)))
+
+
+class Shapes(NamedTuple):
+    """What masks of K components are made of: alpha (B, K, g, g), windows (B, K, 4), presence, depth (B, K)."""
+
+    alpha: Tensor
+    windows: Tensor
+    presence: Tensor
+    depth: Tensor
+
+    def pasted(self, size: int) -> Iterator[tuple[Tensor, Tensor]]:
+        """Masks and importances kappa in images of `size` px, (B, some of K, H, W) at a time."""
+        each = part_size(self.alpha.shape[1], size * size * len(self.alpha), self.alpha)
+        for alpha, windows, presence, depth in zip(*(x.split(each, dim=1) for x in self), strict=True):
+            present = full(alpha) * presence[..., None, None]
+            mask = paster_of(windows, alpha.shape[-1], size).each(present[:, :, None]).squeeze(2)
+            yield mask, torch.sigmoid(-full(depth))[..., None, None] * mask
 
 
 class Frame:
@@ -49,15 +65,34 @@ class Frame:
         self.presence = held(step, presence, step.found).detach()
         self.alpha = held(step, None if step.drawn is None else step.drawn[:, :, -1], step.drawn_found[:, :, -1])
         self.kept = step.kept
+        self._step = step
+
+    def objects(self) -> Shapes:
+        """The kept objects."""
+        return Shapes(self.alpha, self.windows, self.presence, self.depth)
+
+    def untracked(self) -> Shapes:
+        """The D cells, those that are kept with a presence of zero. What is propagated and present is always kept."""
+        step, cells = self._step, self._step.proposals
+        slots = step.kept.shape[1]
+        held = step.kept.new_zeros((len(step.kept), slots + step.found.shape[1]), dtype=torch.long)
+        held = held.scatter_add(1, step.source, step.kept.long())[:, slots:] > 0
+        return Shapes(
+            step.drawn_found[:, :, -1],
+            window_of(cells.where).detach(),
+            step.found.detach() * ~held,
+            cells.depth.detach().squeeze(-1),
+        )
 
 
 def frame_masks(
-    frame: Frame, layers: Layers, foreground: Float[Tensor, "B H W"], readout: Readout
+    frame: Frame,
+    layers: Layers,
+    foreground: Float[Tensor, "B H W"],
+    readout: Readout,
+    untracked: Untracked = "background",
 ) -> Float[Tensor, "B P_plus_1 H W"]:
     """Masks of the kept objects and, last, of the background; they sum to 1.
-
-    Components that are rendered but not kept (proposals with a presence below the tracking threshold) count as
-    background.
 
     Args:
         frame: the kept objects.
@@ -66,29 +101,31 @@ def frame_masks(
         readout: "rendering": the shares that an object and the background have in the rendered pixel, alpha_k w_k and
             1 - A, scaled to sum to 1. "overlay": the original's visualisation, hard masks: background where A is at
             most 0.3, else the component with the largest w_k.
+        untracked: components that are rendered but not kept (proposals with a presence below the tracking threshold):
+            "background": their share of a pixel is the background's; "dropped": they have none, and the kept objects
+            and the background share the pixel.
     """
-    size = foreground.shape[-1]
-    each = part_size(frame.alpha.shape[1], size * size * len(foreground), foreground)
-    objects = []
-    for alpha, windows, presence, depth in zip(
-        *(x.split(each, dim=1) for x in (frame.alpha, frame.windows, frame.presence, frame.depth)), strict=True
-    ):
-        present = full(alpha) * presence[..., None, None]
-        mask = paster_of(windows, alpha.shape[-1], size).each(present[:, :, None]).squeeze(2)
-        importance = torch.sigmoid(-full(depth))[..., None, None] * mask
-        objects.append(importance * mask if readout == "rendering" else importance)
-    masks = torch.cat(objects, dim=1)
-    if readout == "rendering":
-        weight = layers.weight.detach() + GUARD
-        total = (layers.share + (1 - foreground.detach()) * weight).clamp_min(GUARD)
-        masks = masks / total[:, None]
+    size, foreground = foreground.shape[-1], foreground.detach()
+    if readout == "overlay":
+        masks = _overlay(frame, foreground, untracked)
     else:
-        best = masks.max(dim=1, keepdim=True)
-        chosen = torch.zeros_like(masks).scatter_(1, best.indices, 1.0)
-        rest = layers.weight.detach()[:, None] - masks.sum(1, keepdim=True)  # of what is not kept
-        shown = (foreground.detach()[:, None] > FAINT) & (best.values > 0) & (best.values >= rest)
-        masks = chosen * shown
+        masks = torch.cat([importance * mask for mask, importance in frame.objects().pasted(size)], dim=1)
+        share = layers.share if untracked == "background" else masks.sum(1)
+        total = (share + (1 - foreground) * (layers.weight.detach() + GUARD)).clamp_min(GUARD)
+        masks = masks / total[:, None]
     return torch.cat([masks, (1 - masks.sum(1, keepdim=True)).clamp_min(0)], dim=1)
+
+
+def _overlay(frame: Frame, foreground: Float[Tensor, "B H W"], untracked: Untracked) -> Float[Tensor, "B P H W"]:
+    """1 where a kept object has the largest importance of all components and the foreground is shown, else 0."""
+    size = foreground.shape[-1]
+    importance = torch.cat([importance for _, importance in frame.objects().pasted(size)], dim=1)
+    best = importance.max(dim=1, keepdim=True)
+    shown = (foreground[:, None] > FAINT) & (best.values > 0)
+    if untracked == "background":
+        for _, others in frame.untracked().pasted(size):
+            shown &= best.values >= others.amax(dim=1, keepdim=True)
+    return torch.zeros_like(importance).scatter_(1, best.indices, 1.0) * shown
 
 
 def frame_means(

@@ -15,10 +15,12 @@ from apex_lab.models.scalor.glimpses import GlimpseDecoder, GlimpseEncoder
 from apex_lab.models.scalor.latents import Sampler, full_precision
 from apex_lab.models.scalor.propagation import Propagated, Propagation
 from apex_lab.models.scalor.recompute import Recompute
-from apex_lab.models.scalor.slots import FIRST_ID, Objects, Slots, carry, keep, pack, strongest, taken
-from apex_lab.models.scalor.windows import SizeRule, window_of
+from apex_lab.models.scalor.slots import FIRST_ID, Objects, Slots, admitted, carry, keep, pack, strongest
+from apex_lab.models.scalor.windows import SizeRule
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.precision import full
+from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.spatial_transformer import window_of
 from apex_lab.scene import ABSENT, Noise, Schedule
 
 CURRICULUM_ALPHA = 0.9
@@ -197,7 +199,10 @@ class ObjectNetworks(nn.Module):
     ) -> tuple[Int[Tensor, "B P"], Slots]:
         """Candidates that the slots hold after this frame, and the slots."""
         old = slots.objects if propagated is None else propagated.objects  # in the first frame all slots are empty
-        kept = keep(old.presence.squeeze(-1) > 0, found > self.track, slots.ids, slots.next_id)
+        stays, arrives = old.presence.squeeze(-1) > 0, found > self.track
+        if not self.training:  # in training, the cap on discoveries leaves none without a slot
+            arrives = admitted(arrives, found, room(stays, stays.shape[1]))
+        kept = keep(stays, arrives, slots.ids, slots.next_id)
         new = Objects.found(
             proposals.what,
             proposals.where,
@@ -224,7 +229,7 @@ class ObjectNetworks(nn.Module):
             index, valid = (
                 x.unflatten(0, values.shape[:2]) for x in pack(present, min(self.max_objects, values.shape[2]))
             )
-            presence, others = taken(values, index).split([1, values.shape[-1] - 1], dim=-1)
+            presence, others = gather_slots(values, index, dim=2).split([1, values.shape[-1] - 1], dim=-1)
             values = torch.cat([presence * valid[..., None], others], dim=-1)
         curriculum = (schedule["alpha_curriculum"] > 0.5) & (index >= slots)
         counted = torch.where(curriculum, 0.0, 1.0)

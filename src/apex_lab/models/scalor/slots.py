@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from apex_lab.nn.slots import gather_slots
 from apex_lab.scene import ABSENT
 
 FIRST_ID = 1
@@ -80,6 +81,19 @@ def strongest(presence: Float[Tensor, "B D"], count: Int[Tensor, " B"]) -> Bool[
     return (presence > limit) | (count >= d)[:, None]
 
 
+def admitted(
+    arrives: Bool[Tensor, "B D"], presence: Float[Tensor, "B D"], free: Int[Tensor, " B"]
+) -> Bool[Tensor, "B D"]:
+    """The arriving cells that find a slot: the `free` strongest; of equally strong ones the first, row by row.
+
+    The original has no limit in evaluation. Here slots are limited, so where one is missing, what is least surely an
+    object goes without, not what stands in the last rows of the image.
+    """
+    score = presence.masked_fill(~arrives, -torch.inf)
+    rank = score.argsort(dim=1, descending=True, stable=True).argsort(dim=1)
+    return arrives & (rank < free[:, None])
+
+
 def pack(chosen: Bool[Tensor, "B K"], slots: int) -> tuple[Int[Tensor, "B P"], Bool[Tensor, "B P"]]:
     """Indices of the first `slots` chosen candidates, in order, and which of them there are (the first ones).
 
@@ -103,7 +117,7 @@ def keep(
 
     Args:
         stays: propagated objects that are kept.
-        arrives: discovered cells that become objects. Those that find no slot are dropped.
+        arrives: discovered cells that become objects. Those that find no slot are dropped: see `admitted`.
         ids: of the propagated objects.
         next_id: per video.
     """
@@ -123,11 +137,6 @@ def carry(candidates: tuple[Objects, Objects], kept: Kept, flow: Float[Tensor, "
     """
     sizes = [x.shape[-1] for x in candidates[0]]
     whole = torch.cat([torch.cat(group, dim=-1) for group in candidates], dim=1)
-    picked = taken(whole, kept.source) * kept.valid[..., None]
+    picked = gather_slots(whole, kept.source) * kept.valid[..., None]
     picked = torch.where(flow > 0.5, picked, picked.detach())
     return Objects(*picked.split(sizes, dim=-1))
-
-
-def taken(values: Float[Tensor, "*batch K D"], source: Int[Tensor, "*batch P"]) -> Float[Tensor, "*batch P D"]:
-    """Rows of `values` at `source`."""
-    return values.gather(-2, source[..., None].expand(*source.shape, values.shape[-1]))

@@ -14,6 +14,9 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
+from apex_lab.nn.grid import cells
+from apex_lab.nn.spatial_transformer import window_of as window_of
+
 Share = Annotated[float, Field(ge=0, lt=1)]
 Positive = Annotated[float, Field(gt=0)]
 
@@ -77,16 +80,9 @@ class FreeSize(SizeRule):
         return self.smallest + (1 - self.smallest) * torch.sigmoid(raw + self.offset)
 
 
-def cell_centres(grid: int, like: Tensor) -> Float[Tensor, "D 2"]:
-    """(column + 1/2, row + 1/2) of every cell in units of cells; row by row."""
-    at = torch.arange(grid, device=like.device, dtype=like.dtype) + 0.5
-    row, column = torch.meshgrid(at, at, indexing="ij")
-    return torch.stack([column, row], dim=-1).flatten(0, 1)
-
-
 def discovered(raw: Float[Tensor, "B D 4"], size: SizeRule, grid: int) -> Float[Tensor, "B D 4"]:
     """z_where of all cells: a centre can move by a whole cell around its cell's."""
-    centre = (2 / grid) * (cell_centres(grid, raw) + torch.tanh(raw[..., 2:])) - 1
+    centre = (2 / grid) * (cells(grid, raw) + 0.5 + torch.tanh(raw[..., 2:])) - 1
     return torch.cat([size(raw[..., :2]), centre], dim=-1)
 
 
@@ -94,8 +90,3 @@ def propagated(raw: Float[Tensor, "B P 4"], before: Float[Tensor, "B P 4"], size
     """z_where of objects carried on: the centre moves from where it was, the size is inferred from scratch."""
     centre = (before[..., 2:] + SHIFT * torch.tanh(raw[..., 2:])).clamp(-EDGE, EDGE)
     return torch.cat([size(raw[..., :2]), centre], dim=-1)
-
-
-def window_of(where: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """(s_x, s_y, t_x, t_y) -> (s_y, s_x, t_y, t_x), the order of `apex_lab.nn.spatial_transformer`."""
-    return where.unflatten(-1, (2, 2)).flip(-1).flatten(-2)

@@ -18,7 +18,6 @@ from apex_lab.models.space.composition import (
 from apex_lab.models.space.latents import (
     BOUND,
     Cells,
-    for_paste,
     kl_presence,
     relaxed_presence,
     split_gaussian,
@@ -27,7 +26,7 @@ from apex_lab.models.space.latents import (
 from apex_lab.models.space.networks import GlimpseDecoder, GlimpseEncoder, ImageEncoder
 from apex_lab.nn.distributions import Gaussian, kl_gaussian, standard_normal
 from apex_lab.nn.precision import full
-from apex_lab.nn.spatial_transformer import Paster, crop
+from apex_lab.nn.spatial_transformer import Paster, crop, for_paste
 from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import Noise, Schedule
 

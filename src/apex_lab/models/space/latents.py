@@ -10,15 +10,14 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from apex_lab.nn.distributions import Gaussian
+from apex_lab.nn.distributions import LOG_GUARD, Gaussian, kl_bernoulli
+from apex_lab.nn.grid import cells
 from apex_lab.nn.precision import full
+from apex_lab.nn.spatial_transformer import for_paste as for_paste
 from apex_lab.scene import Noise
 
 BOUND = 8.8
 """Largest presence logit, so q(pres) is within [1.5e-4, 0.99985]."""
-
-GUARD = 1e-15
-"""Added to every argument of a logarithm in the KL of presence."""
 
 
 class Cells(NamedTuple):
@@ -42,7 +41,10 @@ def split_gaussian(raw: Float[Tensor, "... two_D"], floor: float = 0.0) -> Gauss
 
 
 def relaxed_presence(logit: Float[Tensor, "..."], temperature: Float[Tensor, ""], noise: Noise) -> Float[Tensor, "..."]:
-    """Relaxed Bernoulli sample sigmoid((logit + log u - log(1 - u)) / temperature), in training and evaluation."""
+    """Relaxed Bernoulli sample sigmoid((logit + log u - log(1 - u)) / temperature), in training and evaluation.
+
+    From the logit itself, as published, where `apex_lab.nn.distributions.relaxed_logit` starts from a probability.
+    """
     tiny = torch.finfo(logit.dtype).eps
     u = noise.uniform(logit).clamp(tiny, 1 - tiny)
     return torch.sigmoid((logit + u.log() - (-u).log1p()) / temperature)
@@ -51,11 +53,9 @@ def relaxed_presence(logit: Float[Tensor, "..."], temperature: Float[Tensor, ""]
 def kl_presence(logit: Float[Tensor, "..."], prior: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
     """KL(Bernoulli(sigmoid(logit)) || Bernoulli(prior)), elementwise; nats.
 
-    Priors down to 1e-10 are used, where 1 - p rounds to 1, so probabilities are guarded by `GUARD` and not clamped.
+    Priors down to 1e-10 are used, where 1 - p rounds to 1, so probabilities are guarded by `LOG_GUARD` and not clamped.
     """
-    q = torch.sigmoid(logit)
-    present = q * ((q + GUARD).log() - (prior + GUARD).log())
-    return present + (1 - q) * ((1 - q + GUARD).log() - (1 - prior + GUARD).log())
+    return kl_bernoulli(torch.sigmoid(logit), prior, added=LOG_GUARD)
 
 
 def windows_of(scale: Float[Tensor, "n N 2"], shift: Float[Tensor, "n N 2"]) -> Float[Tensor, "n N 4"]:
@@ -64,14 +64,6 @@ def windows_of(scale: Float[Tensor, "n N 2"], shift: Float[Tensor, "n N 2"]) -> 
     The centre lies within one cell width of its cell's centre: t = 2 / G (c + 1/2 + tanh(shift)) - 1.
     """
     grid = math.isqrt(scale.shape[1])
-    index = torch.arange(grid, device=scale.device, dtype=scale.dtype)
-    row, column = torch.meshgrid(index, index, indexing="ij")
-    cell = torch.stack([row, column], dim=-1).flatten(0, 1)
+    cell = cells(grid, scale).flip(-1)
     centre = 2 / grid * (cell + 0.5 + torch.tanh(shift.flip(-1))) - 1
     return torch.cat([torch.sigmoid(scale.flip(-1)), centre], dim=-1)
-
-
-def for_paste(windows: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Windows with 1e-9 added to their sizes, which a paste divides by (section 12)."""
-    size, centre = windows.split(2, dim=-1)
-    return torch.cat([size + 1e-9, centre], dim=-1)

@@ -9,9 +9,7 @@ from torch import Tensor
 
 from apex_lab.models.space.foreground import Drawn
 from apex_lab.models.space.latents import Cells
-from apex_lab.scene import Scene
-
-BACKGROUND_ID = 0
+from apex_lab.scene import BACKGROUND_ID, Scene
 
 
 class Found(NamedTuple):

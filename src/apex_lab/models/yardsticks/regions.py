@@ -12,10 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from apex_lab.models.yardsticks.linking import link
-from apex_lab.scene import ABSENT, Context, Scene
-
-BACKGROUND_ID = 0
-"""Identity of the background; objects count from 1."""
+from apex_lab.scene import ABSENT, BACKGROUND_ID, Context, Scene
 
 
 def one_hot(labels: Int[Tensor, "B T H W"], components: int) -> Bool[Tensor, "B T K H W"]:
