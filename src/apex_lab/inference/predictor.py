@@ -96,10 +96,23 @@ def _averaged(found: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.stack([each[name] for each in found if name in each]).mean(0) for name in names}
 
 
+def _terms(scenes: Sequence[Scene]) -> dict[str, Any]:
+    """Loss terms of all chunks' frames, and their weight."""
+    weights = [1.0 if scene.terms_weight is None else scene.terms_weight for scene in scenes]
+    total = None if scenes[-1].terms_weight is None else sum(weights)
+    shares = [weight / (total or 1.0) for weight in weights]
+    terms = {
+        name: torch.stack([scene.terms[name] * share for scene, share in zip(scenes, shares, strict=True)]).sum(0)
+        for name in scenes[-1].terms
+    }
+    return {"terms": terms, "terms_weight": total}
+
+
 def joined(scenes: Sequence[Scene]) -> Scene:
     """Scenes of consecutive chunks of the same videos -> the scene of all their frames.
 
-    Loss terms are summed; diagnostics, which describe a chunk, are averaged over chunks.
+    Loss terms are summed, or averaged by `Scene.terms_weight`; diagnostics, which describe a chunk, are averaged over
+    chunks.
     """
     if len(scenes) == 1:
         return scenes[0]
@@ -112,7 +125,7 @@ def joined(scenes: Sequence[Scene]) -> Scene:
     names = ("masks", "ids", "presence", "appearance", "reconstruction", "windows", "means")
     return Scene(
         background=last.background,
-        terms={name: torch.stack([scene.terms[name] for scene in scenes]).sum(0) for name in last.terms},
+        **_terms(scenes),
         diagnostics=_averaged([scene.diagnostics for scene in scenes]),
         state=last.state,
         **{name: over_time(name) for name in names},

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import weakref
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
+from apex_lab.inference.predictor import joined
 from apex_lab.models.op3 import Op3
+from apex_lab.models.op3.decoder import Decoded, Decoder
 from apex_lab.nn.noise import VideoNoise
 from apex_lab.scene import Context, Scene
 from tests.reference.op3 import NaiveOp3
@@ -97,13 +102,43 @@ def test_chunks_give_what_the_whole_gives(model: Op3, video: Tensor, cut: int) -
     second = model(video[:, cut:], context(cut, state=first.state))
     torch.testing.assert_close(torch.cat([first.masks, second.masks], 1), whole.masks)
     torch.testing.assert_close(torch.cat([first.appearance, second.appearance], 1), whole.appearance)
-    # terms are weighted means over steps: those of the chunks by the sums of their weights
-    before, after = (sum(s.weight for s in model.plan.steps(n, b)) for n, b in ((cut, 0), (4 - cut, cut)))
-    for name, term in whole.terms.items():
-        chunks = (first.terms[name] * before + second.terms[name] * after) / (before + after)
-        torch.testing.assert_close(chunks, term)
+    together = joined([first, second])
+    torch.testing.assert_close(together.terms, whole.terms)
+    assert together.terms_weight == pytest.approx(whole.terms_weight)
     assert second.state.frames == 4
     torch.testing.assert_close(second.state.sample, whole.state.sample)
+
+
+def test_the_weight_of_the_terms_is_the_sum_of_the_steps_weights(model: Op3, video: Tensor) -> None:
+    """Four refinements, then three times a prediction and two refinements (op3.md section 6)."""
+    assert model.eval()(video, context()).terms_weight == 2.5 + 3 * 2.5
+
+
+@pytest.mark.parametrize("frames", [3, 9])
+def test_evaluation_keeps_no_more_of_a_frame_than_its_result(
+    model: Op3, frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the decoder's hidden layers, at most those of two steps are alive at any time, however long the video."""
+    hidden: list[weakref.ref[Tensor]] = []
+    alive: list[int] = []
+    decode = Decoder.forward
+
+    def watched(self: Decoder, *inputs: Any) -> Decoded:
+        decoded = decode(self, *inputs)
+        hidden.extend(weakref.ref(layer) for layer in decoded.hidden)
+        alive.append(sum(layer() is not None for layer in hidden))
+        return decoded
+
+    monkeypatch.setattr(Decoder, "forward", watched)
+    video = torch.rand(1, frames, 3, SIZE, SIZE)
+    with torch.no_grad():
+        scene = model.eval()(video, context(videos=(5,), detail=True))
+    assert max(alive) == 2 * 4
+    assert not any(layer() is not None for layer in hidden)
+    # the result's tensors hold no larger ones that they are parts of
+    for value in (scene.masks, scene.reconstruction, scene.means, scene.appearance):
+        assert value is not None
+        assert value.untyped_storage().nbytes() == value.numel() * value.element_size()
 
 
 def test_a_video_does_not_depend_on_its_company(model: Op3, video: Tensor) -> None:

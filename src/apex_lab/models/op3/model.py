@@ -68,6 +68,22 @@ class Rendered(NamedTuple):
     mixture: Mixture
 
 
+class Shown(NamedTuple):
+    """What the `Scene` holds of a frame: all that is kept of it, so that memory grows by no more than the result.
+
+    Attributes:
+        masks: (B, K, H, W).
+        reconstruction: RGB in [0, 1], (B, 3, H, W).
+        appearance: d and the posterior's mean, not the sample: appearances are compared with one another. (B, K, R + S)
+        means: each slot's RGB in [0, 1], (B, K, 3, H, W); None unless asked for.
+    """
+
+    masks: Tensor
+    reconstruction: Tensor
+    appearance: Tensor
+    means: Tensor | None
+
+
 class Op3(SceneModel):
     """Object-centric perception, prediction and planning, without actions.
 
@@ -75,7 +91,7 @@ class Op3(SceneModel):
     that fits the frame and at the gradients of the loss, and replaces the slots' posterior. An interaction
     network predicts the slots of the next frame, where refinement starts again.
 
-    In evaluation mode no graph is built, so whole videos need the memory of one frame (and their masks). Sampling
+    In evaluation mode no graph is built, so a whole video needs the memory of one frame and of its `Scene`. Sampling
     stays on in evaluation: nothing but its noise tells slots apart.
 
     Args:
@@ -140,7 +156,7 @@ class Op3(SceneModel):
         rendered: Rendered | None = None
         steps = self.plan.steps(video.shape[1], before)
         losses: list[tuple[Tensor, Tensor]] = []
-        frames: list[tuple[Slots, Rendered]] = []
+        frames: list[Shown] = []
         for step, following in zip(steps, [*steps[1:], None], strict=True):
             image, noise = video[:, step.frame], context.noise.at(step.frame)
             if step.kind == "dynamics":
@@ -151,9 +167,9 @@ class Op3(SceneModel):
             rendered = self._render(slots, image, weights)
             losses.append((rendered.mixture.nll(), kl(slots.posterior, slots.prior).sum(1)))
             if following is None or following.frame != step.frame:
-                frames.append((slots, rendered))
+                frames.append(_shown(slots, rendered, context.detail))
         state = State(slots.deterministic, slots.sample, before + video.shape[1])
-        return self._scene(frames, self._terms(steps, losses), _by_kind(steps, losses), state, context.detail)
+        return self._scene(frames, steps, losses, state)
 
     def _start(self, video: Tensor, context: Context) -> Slots:
         """The slots before the first step."""
@@ -216,7 +232,7 @@ class Op3(SceneModel):
 
     def _terms(self, steps: list[PlannedStep], losses: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
         """Weighted means of the steps' losses: the published total is the batch's mean of nll + beta kl."""
-        total = sum(step.weight for step in steps)
+        total = _weight(steps)
         shares = [step.weight / total for step in steps]
         named = zip(self.term_names, zip(*losses, strict=True), strict=True)
         return {
@@ -225,31 +241,40 @@ class Op3(SceneModel):
         }
 
     def _scene(
-        self,
-        frames: list[tuple[Slots, Rendered]],
-        terms: dict[str, Tensor],
-        diagnostics: dict[str, Tensor],
-        state: State,
-        detail: bool,
+        self, frames: list[Shown], steps: list[PlannedStep], losses: list[tuple[Tensor, Tensor]], state: State
     ) -> Scene:
         """The result: every frame as it was after its last step."""
-        masks = torch.stack([rendered.mixture.masks for _, rendered in frames], dim=1)
-        colours = torch.stack([rendered.colours for _, rendered in frames], dim=1)
-        # the mean, not the sample: appearances are compared with one another
-        appearance = [torch.cat([slots.deterministic, slots.posterior.mean], dim=-1) for slots, _ in frames]
-        ids = torch.arange(self.slots, device=masks.device)
+        masks = torch.stack([frame.masks for frame in frames], dim=1)
+        means = [frame.means for frame in frames if frame.means is not None]
         return Scene(
             masks=masks,
             background=torch.zeros(self.slots, dtype=torch.bool, device=masks.device),
-            ids=ids.expand(*masks.shape[:2], -1),
+            ids=torch.arange(self.slots, device=masks.device).expand(*masks.shape[:2], -1),
             presence=masks.new_ones(masks.shape[:3]),
-            appearance=torch.stack(appearance, dim=1),
-            reconstruction=(masks[:, :, :, None] * colours).sum(2).clamp(0, 1),
-            terms=terms,
-            means=colours.clamp(0, 1) if detail else None,
-            diagnostics=diagnostics,
+            appearance=torch.stack([frame.appearance for frame in frames], dim=1),
+            reconstruction=torch.stack([frame.reconstruction for frame in frames], dim=1),
+            terms=self._terms(steps, losses),
+            terms_weight=_weight(steps),
+            means=torch.stack(means, dim=1) if means else None,
+            diagnostics=_by_kind(steps, losses),
             state=state,
         )
+
+
+def _shown(slots: Slots, rendered: Rendered, detail: bool) -> Shown:
+    """What is kept of a frame after its last step."""
+    masks, colours = rendered.mixture.masks, rendered.colours
+    return Shown(
+        masks,
+        (masks[:, :, None] * colours).sum(1).clamp(0, 1),
+        torch.cat([slots.deterministic, slots.posterior.mean], dim=-1),
+        colours.clamp(0, 1) if detail else None,
+    )
+
+
+def _weight(steps: list[PlannedStep]) -> float:
+    """Sum of the steps' weights."""
+    return sum(step.weight for step in steps)
 
 
 def _by_kind(steps: list[PlannedStep], losses: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
