@@ -19,6 +19,7 @@ FORMAT = 2
 ADDED: dict[str, Any] = {
     "trainer.cuda_graph": False,
     "init_from": None,
+    "model.schedule": "rprp",
 }
 """Keys added since `FORMAT` was raised, with the value that they had before they existed."""
 

@@ -14,6 +14,8 @@ from typing import Annotated
 
 from pydantic import Field
 
+from apex_lab.nn.noise import mixed
+
 Steps = Annotated[int, Field(ge=0)]
 
 
@@ -144,3 +146,24 @@ class Staircase(Schedule):
 
     def __call__(self, step: int) -> float:
         return float(self.values[sum(step > milestone for milestone in self.milestones)])
+
+
+@dataclass(frozen=True)
+class Curriculum(Schedule):
+    """A whole number drawn anew for every step, uniform from 1 to a largest one.
+
+    The largest is 1 up to `delay` and grows by 1 every `every` steps after it.
+
+    Args:
+        every: steps.
+        delay: steps.
+        seed: of the draws; a number depends on it and on the step alone.
+    """
+
+    every: Annotated[int, Field(gt=0)]
+    delay: Steps = 0
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def __call__(self, step: int) -> float:
+        largest = 1 + max(0, step - self.delay) // self.every
+        return float(1 + mixed(self.seed, step) % largest)

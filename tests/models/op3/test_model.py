@@ -201,3 +201,30 @@ def test_other_image_sizes_are_refused(model: Op3) -> None:
 
 def test_state_dict_holds_parameters_alone(model: Op3) -> None:
     assert set(model.state_dict()) == {name for name, _ in model.named_parameters()}
+
+
+@pytest.mark.parametrize("schedule", ["single_step_physics", "curriculum"])
+def test_other_schedules_train_and_evaluation_refines_every_frame(schedule: str, model: Op3, video: Tensor) -> None:
+    torch.manual_seed(0)
+    other = Op3(SIZE, 3, 8, 4, 16, schedule=schedule)  # type: ignore[arg-type]
+    assert set(other.schedule_ranges) == ({"predictions"} if schedule == "curriculum" else set())
+    values = {name: torch.tensor(2.0) for name in other.schedule_ranges}
+    scene = other(video, context(schedule=values))
+    assert scene.masks.shape == (2, 4, 3, SIZE, SIZE)
+    torch.testing.assert_close(scene.masks.sum(2), torch.ones(2, 4, SIZE, SIZE))
+    # the first frame's ramp of four refinements, and two or three predictions; one refinement after two
+    assert scene.terms_weight == pytest.approx(2.5 + 3)
+    loss(scene).backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in other.parameters())
+    torch.testing.assert_close(other.eval()(video, context()).masks, model.eval()(video, context()).masks)
+
+
+def test_frames_beyond_the_curriculum_change_no_gradient(model: Op3, video: Tensor) -> None:
+    curriculum = Op3(SIZE, 3, 8, 4, 16, schedule="curriculum")
+    found = []
+    for frames in (2, 4):
+        loss(curriculum(video[:, :frames], context(schedule={"predictions": torch.tensor(1.0)}))).backward()
+        found.append(gradients(curriculum))
+    assert found[0].keys() == found[1].keys()
+    for name, gradient in found[0].items():
+        torch.testing.assert_close(found[1][name], gradient)

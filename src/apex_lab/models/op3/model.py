@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from apex_lab.models.op3.decoder import Decoded, Decoder
 from apex_lab.models.op3.dynamics import Dynamics
 from apex_lab.models.op3.likelihood import ImageGradients, Mixture, image_gradients, mixture
-from apex_lab.models.op3.plan import Plan, PlannedStep, Weighting
+from apex_lab.models.op3.plan import Plan, PlannedStep, ScheduleKind, Weighting
 from apex_lab.models.op3.posterior import UNIT_RAW, RawGaussian, kl, parameter_gradients
 from apex_lab.models.op3.refinement import Memory, Refinement, Seen
 from apex_lab.nn.tiled_conv import TiledWeights
@@ -105,6 +105,8 @@ class Op3(SceneModel):
         first_refinements: of a video's first frame.
         refinements: of every other frame.
         weighting: of the steps' losses, see `Plan`.
+        schedule: of the steps in training, see `plan.listed`; `curriculum` reads the scheduled value `predictions`, the
+            number of dynamics steps in a row. Evaluation refines every frame.
         loss_batch: what the loss is divided by before refinement looks at its gradients. Published: the batch size,
             which makes a video's result depend on its company; so a fixed number here. It matters only where gradients
             are as small as the epsilons of the norms.
@@ -125,11 +127,14 @@ class Op3(SceneModel):
         refinements: Annotated[int, Field(ge=0)] = 2,
         weighting: Weighting = "segment",
         loss_batch: Count = 4,
+        schedule: ScheduleKind = "rprp",
     ) -> None:
         super().__init__()
         self.input_size = (image_size, image_size)
         self.slots, self.sigma, self.beta, self.loss_batch = slots, sigma, beta, loss_batch
-        self.plan = Plan(first_refinements, refinements, weighting)
+        self.plan = Plan(first_refinements, refinements, weighting, schedule)
+        if schedule == "curriculum":  # no other schedule reads the value, so none of them asks for it
+            self.schedule_ranges = {"predictions": (1.0, 1000.0)}  # type: ignore[misc]
         # N(0, 1 / length), shared by all slots: noise alone tells them apart
         self.start_deterministic = nn.Parameter(torch.randn(deterministic) / deterministic**0.5)
         self.start_mean = nn.Parameter(torch.randn(stochastic) / stochastic**0.5)
@@ -154,7 +159,7 @@ class Op3(SceneModel):
         before = 0 if context.state is None else context.state.frames
         slots = self._start(video, context)
         rendered: Rendered | None = None
-        steps = self.plan.steps(video.shape[1], before)
+        steps = self._steps(video.shape[1], before, context)
         losses: list[tuple[Tensor, Tensor]] = []
         frames: list[Shown] = []
         for step, following in zip(steps, [*steps[1:], None], strict=True):
@@ -170,6 +175,13 @@ class Op3(SceneModel):
                 frames.append(_shown(slots, rendered, context.detail))
         state = State(slots.deterministic, slots.sample, before + video.shape[1])
         return self._scene(frames, steps, losses, state)
+
+    def _steps(self, frames: int, before: int, context: Context) -> list[PlannedStep]:
+        """The steps of this pass."""
+        if not self.training or before > 0:
+            return self.plan.steps(frames, before)
+        predictions = int(context.schedule["predictions"]) if self.plan.schedule == "curriculum" else 1
+        return self.plan.training_steps(frames, predictions)
 
     def _start(self, video: Tensor, context: Context) -> Slots:
         """The slots before the first step."""
