@@ -149,6 +149,9 @@ class SceneModel(nn.Module):
     optional_schedules: ClassVar[tuple[str, ...]] = ()
     """Those of `schedule_ranges` that a configuration may leave out."""
 
+    evaluates_at_end: bool = False
+    """True: validation and evaluation call the model with the values that its schedules end with, whatever the step."""
+
     needs_training: bool = True
     """False for models that have nothing to learn by gradient (the classical yardsticks)."""
 

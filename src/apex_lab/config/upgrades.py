@@ -20,6 +20,7 @@ ADDED: dict[str, Any] = {
     "trainer.cuda_graph": False,
     "init_from": None,
     "model.schedule": "rprp",
+    "clips.starts": "random",
 }
 """Keys added since `FORMAT` was raised, with the value that they had before they existed."""
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 import itertools
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import Field
 
 from apex_lab.nn.noise import mixed
+from apex_lab.scene import SceneModel
 
 Steps = Annotated[int, Field(ge=0)]
 
@@ -25,6 +27,16 @@ class Schedule(ABC):
     @abstractmethod
     def __call__(self, step: int) -> float:
         """The value that the batch after `step` weight updates is trained with."""
+
+
+END = 100_000_000
+"""A step at which schedules have their last value; the published evaluation of SPACE passes it (space.md section 8)."""
+
+
+def in_evaluation(schedules: Mapping[str, Callable[[int], float]], model: SceneModel, step: int) -> dict[str, float]:
+    """The scheduled values that validation and evaluation call a model with after `step` weight updates."""
+    at = END if model.evaluates_at_end else step
+    return {name: float(schedule(at)) for name, schedule in schedules.items()}
 
 
 @dataclass(frozen=True)

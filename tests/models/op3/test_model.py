@@ -12,6 +12,8 @@ from torch import Tensor
 from apex_lab.inference.predictor import joined
 from apex_lab.models.op3 import Op3
 from apex_lab.models.op3.decoder import Decoded, Decoder
+from apex_lab.models.op3.posterior import RawGaussian
+from apex_lab.models.op3.refinement import Memory, Refinement, Seen
 from apex_lab.nn.noise import VideoNoise
 from apex_lab.scene import Context, Scene
 from tests.reference.op3 import NaiveOp3
@@ -64,6 +66,32 @@ def test_the_naive_twin_agrees(weighting: str, first: int, later: int, video: Te
     for name, gradient in wanted.items():
         # the scales of the norms have gradients that nearly cancel
         assert float((found[name] - gradient).abs().max()) <= 2e-3 * float(gradient.abs().max()) + 1e-6 * largest, name
+
+
+def test_without_a_number_the_loss_is_divided_by_the_batch(video: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """op3.md section 4: dL/dm = -p / (P + 1e-12) / B and dL/dx = m p / (P + 1e-12) (x - y) / (3 sigma^2) / B."""
+    seen: list[Seen] = []
+    refine = Refinement.forward
+
+    def watched(self: Refinement, looked_at: Seen, memory: Memory) -> tuple[RawGaussian, Memory]:
+        seen.append(looked_at)
+        return refine(self, looked_at, memory)
+
+    monkeypatch.setattr(Refinement, "forward", watched)
+    torch.manual_seed(0)
+    model = Op3(SIZE, 3, 8, 4, 16, loss_batch=None)
+    assert model.batch_statistics  # a share of the batch has another size
+    assert not Op3(SIZE, 3, 8, 4, 16).batch_statistics
+    for training, batch in ((True, 2), (False, 1)):
+        seen.clear()
+        model.train(training)(video, context())
+        for step in seen:
+            masks, density, total = step.mixture
+            to_masks = -density / (total + 1e-12)[:, None] / batch
+            torch.testing.assert_close(step.gradients.masks, to_masks)
+            errors = step.colours - step.image[:, None]
+            to_colours = -(masks * to_masks)[:, :, None] * errors / (3 * 0.1**2)
+            torch.testing.assert_close(step.gradients.colours, to_colours)
 
 
 def test_evaluation_is_the_same_computation_without_a_graph(model: Op3, video: Tensor) -> None:

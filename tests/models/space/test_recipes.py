@@ -10,7 +10,10 @@ import pytest
 import torch
 import yaml
 
+from apex_lab.config.schema import build_model
 from apex_lab.models.space import Space
+from apex_lab.runs.checkpoints import inference_part
+from tests.conftest import compose_job
 from tests.models.space.common import published
 
 CONF = Path(__file__).parents[3] / "conf"
@@ -56,3 +59,11 @@ def test_paper_schedules_are_the_published_ones() -> None:
     for name, key in pairs.items():
         values = [linear(schedule[name], step) for step in arrays["anneal_steps"].tolist()]
         torch.testing.assert_close(torch.tensor(values), arrays[key], atol=1e-5, rtol=0)
+
+
+def test_evaluation_uses_the_values_that_the_schedules_end_with() -> None:
+    """space.md sections 8 and 10; so does a checkpoint from the midst of training."""
+    config = compose_job("model=space", "scale=smoke").config
+    found = inference_part(config, build_model(config), step=1)["schedule"]
+    ends = {"temperature": 0.5, "presence_prior": 0.01, "scale_prior": -2.0, "fix_alpha": 0.0, "fixed_alpha": 0.1}
+    assert found == pytest.approx(ends)

@@ -107,9 +107,9 @@ class Op3(SceneModel):
         weighting: of the steps' losses, see `Plan`.
         schedule: of the steps in training, see `plan.listed`; `curriculum` reads the scheduled value `predictions`, the
             number of dynamics steps in a row. Evaluation refines every frame.
-        loss_batch: what the loss is divided by before refinement looks at its gradients. Published: the batch size,
-            which makes a video's result depend on its company; so a fixed number here. It matters only where gradients
-            are as small as the epsilons of the norms.
+        loss_batch: what the loss is divided by before refinement looks at its gradients. It matters only where they are
+            as small as the epsilons of the norms. None: the batch size, as published, which makes a video's result
+            depend on its company in training; in evaluation a video counts as a batch of its own.
     """
 
     term_names = ("nll", "kl")
@@ -126,12 +126,13 @@ class Op3(SceneModel):
         first_refinements: Count = 4,
         refinements: Annotated[int, Field(ge=0)] = 2,
         weighting: Weighting = "segment",
-        loss_batch: Count = 4,
+        loss_batch: Count | None = 4,
         schedule: ScheduleKind = "rprp",
     ) -> None:
         super().__init__()
         self.input_size = (image_size, image_size)
         self.slots, self.sigma, self.beta, self.loss_batch = slots, sigma, beta, loss_batch
+        self.batch_statistics = loss_batch is None
         self.plan = Plan(first_refinements, refinements, weighting, schedule)
         if schedule == "curriculum":  # no other schedule reads the value, so none of them asks for it
             self.schedule_ranges = {"predictions": (1.0, 1000.0)}  # type: ignore[misc]
@@ -239,7 +240,7 @@ class Op3(SceneModel):
         )
         to_sample = pulled.unflatten(0, slots.sample.shape[:2])[..., -slots.sample.shape[-1] :]
         to_mean, to_raw = parameter_gradients(slots.posterior, slots.prior, slots.eps, to_sample, self.beta)
-        share = 1 / self.loss_batch
+        share = 1 / (self.loss_batch or (len(image) if self.training else 1))
         return ImageGradients(*(x * share for x in found)), to_mean * share, to_raw * share
 
     def _terms(self, steps: list[PlannedStep], losses: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
