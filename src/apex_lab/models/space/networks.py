@@ -54,7 +54,8 @@ class _Normalised(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, eps: float) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
-        variance, mean = torch.var_mean(x, (0, 2, 3), unbiased=False)
+        mean = x.mean((0, 2, 3))
+        variance = (x - mean[:, None, None]).square_().mean((0, 2, 3))  # torch.var takes three times as long
         ctx.save_for_backward(x, weight, mean, torch.rsqrt(variance + eps))
         ctx.eps = eps
         ctx.mark_non_differentiable(mean, variance)
