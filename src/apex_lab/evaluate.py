@@ -116,6 +116,10 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
     if asked.pictures_by not in ranks:
         hint = did_you_mean(asked.pictures_by, ranks) or f": choose one of {', '.join(ranks)}"
         raise UserError(sentence(f"pictures_by = {shown(asked.pictures_by)} ranks no videos{hint}"))
+    if asked.export is not None and asked.scoring.resize == "truth":
+        raise UserError(
+            "scoring.resize = truth scores masks of the model's size, export writes the video's: leave one out."
+        )
     config.device(asked.accelerator)
     files, bad = find([asked.checkpoint] if isinstance(asked.checkpoint, str) else asked.checkpoint or [])
     if not files:

@@ -290,6 +290,7 @@ def test_models_without_identities_get_no_tracking(make_run: Make, ask: Ask, mon
     [
         (("pictures_by=ari_fq",), "pictures_by = 'ari_fq' ranks no videos; did you mean 'ari_fg'?"),
         (("export=avi",), "export = 'avi' is wrong: input should be 'npz', 'coco'"),
+        (("export=npz", "scoring.resize=truth"), "scoring.resize = truth scores masks of the model's size"),
         (("scoring.tracking.min_iou=2",), "min_iou is 2.0; it must lie in (0, 1]."),
         (("scoring.tracking.first_frme=2",), "Unknown key scoring.tracking.first_frme = 2"),
         (("truth=a.npz",), "truth = 'a.npz' goes with predictions=... alone: leave it out."),
