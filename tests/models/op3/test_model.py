@@ -96,12 +96,21 @@ def test_without_a_number_the_loss_is_divided_by_the_batch(video: Tensor, monkey
 
 def test_evaluation_is_the_same_computation_without_a_graph(model: Op3, video: Tensor) -> None:
     trained = model(video, context())
-    evaluated = model.eval()(video, context())
+    with torch.no_grad():
+        evaluated = model.eval()(video, context())
     assert trained.masks.requires_grad
     assert not evaluated.masks.requires_grad
     torch.testing.assert_close(evaluated.masks, trained.masks.detach())
     with torch.no_grad():
         torch.testing.assert_close(model.train()(video, context()).masks, evaluated.masks)
+
+
+def test_evaluation_mode_has_gradients_where_they_are_on(model: Op3, video: Tensor) -> None:
+    loss(model(video, context())).backward()
+    wanted = gradients(model)
+    loss(model.eval()(video, context())).backward()
+    for name, gradient in gradients(model).items():
+        torch.testing.assert_close(gradient, wanted[name])
 
 
 def test_scene(model: Op3, video: Tensor) -> None:

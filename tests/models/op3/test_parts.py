@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -263,6 +264,54 @@ def test_parameter_counts() -> None:
     assert count(dynamics) == 280_417
     assert count(model.decoder) == 184_132
     assert count(model) == 876_305
+
+
+NAMES = {
+    "initial_deter_state": "start_deterministic",
+    "initial_lambdas1": "start_mean",
+    "initial_lambdas2": "start_raw",
+    "refinement_net.conv_layers.": "refinement.convs.",
+    "refinement_net.fc_layers.0.": "refinement.compress.",
+    "refinement_net.lstm.": "refinement.lstm.",
+    "refinement_net.last_fc.": "refinement.to_mean.",
+    "refinement_net.last_fc2.": "refinement.to_raw.",
+    "dynamics_net.inertia_encoder.": "dynamics.inertia.",
+    "dynamics_net.pairwise_encoder_network.": "dynamics.pair.",
+    "dynamics_net.interaction_effect_network.": "dynamics.effect.",
+    "dynamics_net.interaction_attention_network.": "dynamics.attention.",
+    "dynamics_net.final_merge_network.": "dynamics.merge.",
+    "dynamics_net.det_output.": "dynamics.to_deterministic.",
+    "dynamics_net.lambdas1_output.": "dynamics.to_mean.",
+    "dynamics_net.lambdas2_output.": "dynamics.to_raw.",
+    "decode_net.broadcast_net.conv_layers.0.": "decoder.first.",
+    **{f"decode_net.broadcast_net.conv_layers.{i + 1}.": f"decoder.others.{i}." for i in range(4)},
+    "layer_norms_2d.0.": "refinement.norm_masks.",
+    "layer_norms_2d.1.": "refinement.norm_density.",
+    "layer_norms_2d.2.": "refinement.norm_others.",
+    "layer_norms_2d.3.": "refinement.norm_colours.",
+    "layer_norms_1d.0.": "refinement.norm_mean.",
+    "layer_norms_1d.1.": "refinement.norm_raw.",
+}
+"""Beginnings of the published names of weights -> of ours."""
+
+ENDS = {"fcs.0.": "0.", "last_fc.": "2.", "_l0": "", "gamma": "scale", "beta": "shift", "scale_param": "scale"}
+
+
+def own_name(published: str) -> str:
+    """Our name of a published weight."""
+    start = max((start for start in NAMES if published.startswith(start)), key=len)
+    rest = published.removeprefix(start)
+    for theirs, ours in {**ENDS, "center_param": "shift"}.items():
+        rest = rest.replace(theirs, ours)
+    return NAMES[start] + rest
+
+
+def test_all_published_weights_have_a_place() -> None:
+    """Names and shapes of the published networks with S = R = 4 and images of 8 x 8."""
+    wanted = json.loads((Path(__file__).parent / "fixtures" / "weights.json").read_text())
+    found = {name: list(weight.shape) for name, weight in Op3(8, 3, 4, 4, 128).named_parameters()}
+    assert found == {own_name(name): shape for name, shape in wanted.items()}
+    assert len(found) == len(wanted) == 71
 
 
 def test_initial_weights() -> None:

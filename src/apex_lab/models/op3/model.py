@@ -91,7 +91,8 @@ class Op3(SceneModel):
     that fits the frame and at the gradients of the loss, and replaces the slots' posterior. An interaction
     network predicts the slots of the next frame, where refinement starts again.
 
-    In evaluation mode no graph is built, so a whole video needs the memory of one frame and of its `Scene`. Sampling
+    No step of inference needs a graph (`Decoder.pull_back`), so under `no_grad`, where evaluation runs, a whole video
+    needs the memory of one frame and of its `Scene`. Sampling
     stays on in evaluation: nothing but its noise tells slots apart.
 
     Args:
@@ -151,11 +152,6 @@ class Op3(SceneModel):
                 f"the model was built for images of {self.input_size} px, the video has {tuple(video.shape[-2:])}: "
                 "resize it or set model.image_size"
             )
-        # no step of inference needs a graph (`Decoder.pull_back`), so only training builds one
-        with torch.set_grad_enabled(self.training and torch.is_grad_enabled()):
-            return self._infer(video, context)
-
-    def _infer(self, video: Tensor, context: Context) -> Scene:
         weights = self.decoder.prepare()
         before = 0 if context.state is None else context.state.frames
         slots = self._start(video, context)
