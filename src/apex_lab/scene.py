@@ -173,6 +173,9 @@ class SceneModel(nn.Module):
     input_size: tuple[int, int] | None = None
     """(H, W) in pixels for a model built for one size: videos are resized to it, masks back. None: any size."""
 
+    changeable: ClassVar[tuple[str, ...]] = ()
+    """Arguments of the constructor that no weight depends on: a trained model can be built with others."""
+
     def initialise(self, statistics: Statistics) -> None:
         """Called once before training starts from scratch. The default does nothing."""
 

@@ -114,6 +114,7 @@ class Op3(SceneModel):
     """
 
     term_names = ("nll", "kl")
+    changeable = ("slots", "first_refinements", "refinements")
 
     def __init__(
         self,

@@ -76,6 +76,7 @@ class SlotAttention(SceneModel):
 
     term_names = ("mse",)
     tracks = False
+    changeable = ("slots", "iterations")
 
     def __init__(
         self,
