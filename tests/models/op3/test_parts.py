@@ -311,7 +311,7 @@ def test_all_published_weights_have_a_place() -> None:
     wanted = json.loads((Path(__file__).parent / "fixtures" / "weights.json").read_text())
     found = {name: list(weight.shape) for name, weight in Op3(8, 3, 4, 4, 128).named_parameters()}
     assert found == {own_name(name): shape for name, shape in wanted.items()}
-    assert len(found) == len(wanted) == 71
+    assert len(found) == len(wanted) == 73
 
 
 def test_initial_weights() -> None:

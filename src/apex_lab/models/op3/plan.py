@@ -15,6 +15,9 @@ ScheduleKind = Literal["rprp", "single_step_physics", "curriculum"]
 Weighting = Literal["segment", "linear"]
 Kind = Literal["refine", "dynamics"]
 
+REFINE: Kind = "refine"
+DYNAMICS: Kind = "dynamics"
+
 
 class Listed(NamedTuple):
     """A schedule written out.
@@ -66,9 +69,9 @@ def listed(
     if schedule == "rprp":
         kinds = _frame_by_frame(first, later, length)
     elif schedule == "single_step_physics":
-        kinds = ["refine"] * min(first, length) + ["dynamics"] * (length - first)
+        kinds = [REFINE] * min(first, length) + [DYNAMICS] * (length - first)
     else:
-        kinds = ["refine"] * first + ["dynamics"] * predictions + ["refine"]
+        kinds = [REFINE] * first + [DYNAMICS] * predictions + [REFINE]
     kinds = kinds if available is None else _capped(kinds, available)
     return Listed(kinds, _weights(kinds, weighting), _readout(kinds))
 
@@ -77,7 +80,7 @@ def _frame_by_frame(first: int, later: int, frames: int, starts: bool = True) ->
     """The steps of `rprp` for some frames, the first of which is the video's first or not."""
     kinds: list[Kind] = []
     for frame in range(frames):
-        kinds += ["refine"] * first if starts and frame == 0 else ["dynamics", *["refine"] * later]
+        kinds += [REFINE] * first if starts and frame == 0 else [DYNAMICS, *[REFINE] * later]
     return kinds
 
 
@@ -85,7 +88,7 @@ def _capped(kinds: list[Kind], available: int) -> list[Kind]:
     """Refinements in place of the dynamics steps beyond the last frame."""
     found: list[Kind] = []
     for kind in kinds:
-        found.append("refine" if found.count("dynamics") >= available - 1 else kind)
+        found.append(REFINE if found.count(DYNAMICS) >= available - 1 else kind)
     return found
 
 
@@ -95,7 +98,7 @@ def _weights(kinds: list[Kind], weighting: Weighting, before: int = 0) -> list[f
         return [float(before + i + 1) for i in range(len(kinds))]
     weights: list[float] = []
     for part in _segments(kinds):
-        weights += [(j + 1) / len(part) if kind == "refine" else 1.0 for j, kind in enumerate(part)]
+        weights += [(j + 1) / len(part) if kind == REFINE else 1.0 for j, kind in enumerate(part)]
     return weights
 
 
@@ -103,7 +106,7 @@ def _segments(kinds: list[Kind]) -> list[list[Kind]]:
     """Runs of refinements, and dynamics steps one by one."""
     segments: list[list[Kind]] = []
     for kind in kinds:
-        if kind == "refine" and segments and segments[-1][0] == "refine":
+        if kind == REFINE and segments and segments[-1][0] == REFINE:
             segments[-1].append(kind)
         else:
             segments.append([kind])
@@ -112,7 +115,7 @@ def _segments(kinds: list[Kind]) -> list[list[Kind]]:
 
 def _readout(kinds: list[Kind]) -> list[int]:
     """The step before each dynamics step, and the last."""
-    return [i for i in range(len(kinds)) if i + 1 == len(kinds) or kinds[i + 1] == "dynamics"]
+    return [i for i in range(len(kinds)) if i + 1 == len(kinds) or kinds[i + 1] == DYNAMICS]
 
 
 @dataclass(frozen=True)
@@ -148,13 +151,13 @@ class Plan:
         length = self.first + frames - 1 if self.schedule == "single_step_physics" else frames
         found = listed(self.schedule, self.first, self.later, length, self.weighting, frames, predictions)
         steps = _placed(found.kinds, found.weights)
-        return steps + [PlannedStep("dynamics", frame, 0.0) for frame in range(len(found.readout), frames)]
+        return steps + [PlannedStep(DYNAMICS, frame, 0.0) for frame in range(len(found.readout), frames)]
 
 
 def _placed(kinds: list[Kind], weights: list[float], frame: int = 0) -> list[PlannedStep]:
     """Steps with the frames that they are scored on: a dynamics step goes to the next one, from `frame` on."""
     steps: list[PlannedStep] = []
     for kind, weight in zip(kinds, weights, strict=True):
-        frame += kind == "dynamics"
+        frame += kind == DYNAMICS
         steps.append(PlannedStep(kind, frame, weight))
     return steps
