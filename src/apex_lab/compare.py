@@ -72,7 +72,13 @@ def main() -> None:
     """Entry point: `python -m apex_lab.compare`."""
     cli.launch(
         cli.Command(
-            "compare", check_comparison, compare, title, literal=("video", "folder"), any_data=True, model_groups=False
+            "compare",
+            check_comparison,
+            compare,
+            title,
+            literal=("video", "folder"),
+            of_checkpoint=("data.",),
+            model_groups=False,
         )
     )
 

@@ -53,6 +53,7 @@ class EvaluateConfig(BaseModel):
     batch_size: int = Field(default=4, ge=1)
     chunk: int | None = Field(default=None, ge=1)
     data: dict[str, Any] = Field(default_factory=dict)
+    model: dict[str, Any] = Field(default_factory=dict)
     seed: int = Field(default=0, ge=0)
     trust: bool = False
     scoring: ScoringPart
@@ -61,7 +62,7 @@ class EvaluateConfig(BaseModel):
 
 OF_CHECKPOINTS: dict[str, Any] = {
     **{"videos": None, "export": None, "folder": None, "again": False},
-    **{"data": {}, "chunk": None, "trust": False},
+    **{"data": {}, "model": {}, "chunk": None, "trust": False},
 }
 OF_PREDICTIONS: dict[str, Any] = {
     **{"format": None, "truth": None, "partial": False, "resize": None, "output": None},
@@ -83,7 +84,7 @@ class Evaluation:
 
 def main() -> None:
     """Entry point: `python -m apex_lab.evaluate`."""
-    cli.launch(cli.Command("evaluate", check_evaluation, evaluate, title, any_data=True))
+    cli.launch(cli.Command("evaluate", check_evaluation, evaluate, title, of_checkpoint=("data.", "model.")))
 
 
 def title(job: Evaluation) -> str:
@@ -116,13 +117,17 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
     if asked.pictures_by not in ranks:
         hint = did_you_mean(asked.pictures_by, ranks) or f": choose one of {', '.join(ranks)}"
         raise UserError(sentence(f"pictures_by = {shown(asked.pictures_by)} ranks no videos{hint}"))
+    if asked.export is not None and asked.scoring.resize == "truth":
+        raise UserError(
+            "scoring.resize = truth scores masks of the model's size, export writes the video's: leave one out."
+        )
     config.device(asked.accelerator)
     files, bad = find([asked.checkpoint] if isinstance(asked.checkpoint, str) else asked.checkpoint or [])
     if not files:
         raise UserError("checkpoint = [] names no file: give a .ckpt file or a run folder.")
     given = [word.lstrip("+").partition("=")[0] for word in overrides if word.lstrip("+").startswith("data.")]
     data = OtherData(asked.data, tuple(key.removeprefix("data.") for key in given))
-    good, unread = look(files, asked.paths, data, asked.trust, asked.batch_size, asked.chunk)
+    good, unread = look(files, asked.paths, data, asked.trust, asked.batch_size, asked.chunk, asked.model)
     if len(files) + len(bad) == 1 and good:
         _, stored = load(files[0], asked.paths, data, asked.trust)
         if asked.scoring.masks == "posterior":
@@ -186,6 +191,7 @@ def _request(asked: EvaluateConfig, data: OtherData) -> Request:
         batch_size=asked.batch_size,
         chunk=asked.chunk,
         trust=asked.trust,
+        model=asked.model,
     )
 
 

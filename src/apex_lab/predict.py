@@ -51,6 +51,7 @@ class PredictConfig(BaseModel):
     again: bool
     accelerator: Literal["auto", "cpu", "gpu"]
     trust: bool
+    model: dict[str, Any] = Field(default_factory=dict)
     paths: config.PathsPart
 
 
@@ -72,7 +73,13 @@ def main() -> None:
     """Entry point: `python -m apex_lab.predict`."""
     cli.launch(
         cli.Command(
-            "predict", check_prediction, predict, title, literal=("checkpoint", "video", "folder"), model_groups=False
+            "predict",
+            check_prediction,
+            predict,
+            title,
+            literal=("checkpoint", "video", "folder"),
+            of_checkpoint=("model.",),
+            model_groups=False,
         )
     )
 
@@ -116,8 +123,8 @@ def predict(job: Prediction) -> None:
     """
     asked = job.asked
     content = checkpoints.load(job.file, asked.trust)
-    segmenter = segmenter_of(job.file, content, config.device(asked.accelerator), asked.fit)
-    weights = Weights(job.file, digest_of(job.file))
+    segmenter = segmenter_of(job.file, content, config.device(asked.accelerator), asked.fit, changes=asked.model)
+    weights = Weights(job.file, digest_of(job.file), asked.model)
     model = type(segmenter.predictor.model).__name__
     if not segmenter.tracks:
         console.warn(f"{model} does not track: objects are linked by the overlap of their masks from frame to frame.")
@@ -148,7 +155,8 @@ def predict(job: Prediction) -> None:
 def _folder(job: Prediction, weights: Weights) -> Path:
     if job.asked.folder is not None:
         return Path(job.asked.folder)
-    return Path(job.asked.paths.outputs) / "predict" / f"{job.file.stem}_{weights.sha256[:8]}"
+    changes = "".join(f"_{name}_{value}" for name, value in sorted(job.asked.model.items()))
+    return Path(job.asked.paths.outputs) / "predict" / f"{job.file.stem}_{weights.sha256[:8]}{changes}"
 
 
 def _locked(folder: Path) -> FileLock:

@@ -83,6 +83,8 @@ class Scene:
         reconstruction: RGB in [0, 1].
         terms: loss terms, one value per video (summed over its frames), each under its own name; the objective to
             minimise is their weighted sum.
+        terms_weight: for models whose terms are weighted means over the pass: the sum of its weights, by which terms
+            of consecutive chunks of a video are averaged. None: terms are sums, which add up over chunks.
         windows: z_where per component as (s_y, s_x, t_y, t_x): size as a share of the image side, centre in [-1, 1];
             NaN where a component has no window. None for models without windows, and without `Context.detail`.
         means: each component's own RGB image in [0, 1], before masking; None for models without, and without
@@ -98,6 +100,7 @@ class Scene:
     appearance: Float[Tensor, "B T K A"]
     reconstruction: Float[Tensor, "B T 3 H W"]
     terms: dict[str, Float[Tensor, " B"]]
+    terms_weight: float | None = None
     windows: Float[Tensor, "B T K 4"] | None = None
     means: Float[Tensor, "B T K 3 H W"] | None = None
     diagnostics: dict[str, Tensor] = field(default_factory=dict)
@@ -149,6 +152,9 @@ class SceneModel(nn.Module):
     optional_schedules: ClassVar[tuple[str, ...]] = ()
     """Those of `schedule_ranges` that a configuration may leave out."""
 
+    evaluates_at_end: bool = False
+    """True: validation and evaluation call the model with the values that its schedules end with, whatever the step."""
+
     needs_training: bool = True
     """False for models that have nothing to learn by gradient (the classical yardsticks)."""
 
@@ -169,6 +175,9 @@ class SceneModel(nn.Module):
 
     input_size: tuple[int, int] | None = None
     """(H, W) in pixels for a model built for one size: videos are resized to it, masks back. None: any size."""
+
+    changeable: ClassVar[tuple[str, ...]] = ()
+    """Arguments of the constructor that no weight depends on: a trained model can be built with others."""
 
     def initialise(self, statistics: Statistics) -> None:
         """Called once before training starts from scratch. The default does nothing."""

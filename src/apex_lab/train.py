@@ -45,6 +45,7 @@ from apex_lab.training.learner import Diverged
 from apex_lab.training.loggers import Curves
 from apex_lab.training.longer import Shorter
 from apex_lab.training.pictures import Pictures
+from apex_lab.training.schedules import in_evaluation
 from apex_lab.training.showing import Showing, closing
 
 
@@ -248,7 +249,7 @@ def _evaluate(
     asked = config.evaluation
     # a callback may have ended training before the last step
     step = run.record["steps"] if model.needs_training else config.trainer.max_steps
-    schedule = schedule_at({n: s(step) for n, s in build_schedules(config).items()}, device)
+    schedule = schedule_at(in_evaluation(build_schedules(config), model, step), device)
     return evaluation.evaluate(
         evaluation.Asked(
             folder=run.folder,

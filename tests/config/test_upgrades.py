@@ -139,7 +139,7 @@ def test_excluded_keys_change_no_fingerprint(key: str) -> None:
 
 def test_every_added_key_has_its_default() -> None:
     """In the schema, or in the files of the models that have it."""
-    configs = [compose_job(f"model={model}").config.model_dump() for model in ("apex", "gswm", "scalor")]
+    configs = [compose_job(f"model={model}").config.model_dump() for model in ("apex", "gswm", "op3", "scalor")]
     for key, before in ADDED.items():
         found: list[Any] = []
         for value in configs:
@@ -147,4 +147,5 @@ def test_every_added_key_has_its_default() -> None:
                 value = value.get(word, {}) if isinstance(value, dict) else {}
             found += [] if value == {} else [value]
         assert found, key
-        assert all(value == before for value in found), key
+        # the recipe of OP3 cuts disjoint clips
+        assert before in found if key == "clips.starts" else all(value == before for value in found), key

@@ -82,3 +82,37 @@ def test_what_cannot_be_drawn_is_refused():
         ClipSampler([5], 6, 0, 0, 1, ranks=4)
     with pytest.raises(UserError, match=r"clips.frames is 4 at step 3, but the shortest training video has 3 frames"):
         ClipSampler([5, 3], 2, 0, 0, 6, lambda step: step + 1)
+
+
+@given(st.lists(st.integers(5, 23), min_size=1, max_size=6), st.integers(1, 12), st.integers(0, 3))
+def test_disjoint_clips_cut_every_video_into_pieces_that_come_once_an_epoch(
+    lengths: list[int], batch_size: int, seed: int
+):
+    pieces = [Clip(video, 5 * i, 5) for video, length in enumerate(lengths) for i in range(length // 5)]
+    batches = ClipSampler(lengths, batch_size, seed, 0, 2 * len(pieces), lambda step: 5, starts="disjoint")
+    row = [clip for batch in batches for clip in batch]
+    for epoch in range(len(row) // len(pieces)):
+        assert Counter(row[epoch * len(pieces) : (epoch + 1) * len(pieces)]) == Counter(pieces)
+
+
+def test_a_video_of_twenty_frames_is_four_clips_of_five():
+    """op3.md section 1: 2,000 episodes are 8,000 clips, and 40,000 steps of 4 are 20 passes over them."""
+    batches = ClipSampler([20] * 2000, 4, 0, 0, 2000, lambda step: 5, starts="disjoint")
+    clips = Counter(clip for batch in batches for clip in batch)
+    assert len(clips) == 8000
+    assert set(clips.values()) == {1}
+    assert {clip.start for clip in clips} == {0, 5, 10, 15}
+
+
+def test_disjoint_clips_resume_share_batches_and_draw_views():
+    def clips(start: int, **options: int) -> list[list[Clip]]:
+        return list(ClipSampler([7] * 5, 4, 1, start, 9, lambda step: 2 + step // 5, 2, starts="disjoint", **options))
+
+    assert clips(3) == clips(0)[3:]
+    assert [a + b for a, b in zip(clips(0, rank=0, ranks=2), clips(0, rank=1, ranks=2), strict=True)] == clips(0)
+    assert {clip.view for batch in clips(0) for clip in batch} == {0, 1}
+    assert clips(0) != list(ClipSampler([7] * 5, 4, 1, 0, 9, lambda step: 2 + step // 5, 2))
+
+
+def test_whole_videos_have_no_starts():
+    assert list(ClipSampler([7] * 5, 4, 1, 0, 9, starts="disjoint")) == list(ClipSampler([7] * 5, 4, 1, 0, 9))

@@ -290,6 +290,7 @@ def test_models_without_identities_get_no_tracking(make_run: Make, ask: Ask, mon
     [
         (("pictures_by=ari_fq",), "pictures_by = 'ari_fq' ranks no videos; did you mean 'ari_fg'?"),
         (("export=avi",), "export = 'avi' is wrong: input should be 'npz', 'coco'"),
+        (("export=npz", "scoring.resize=truth"), "scoring.resize = truth scores masks of the model's size"),
         (("scoring.tracking.min_iou=2",), "min_iou is 2.0; it must lie in (0, 1]."),
         (("scoring.tracking.first_frme=2",), "Unknown key scoring.tracking.first_frme = 2"),
         (("truth=a.npz",), "truth = 'a.npz' goes with predictions=... alone: leave it out."),
@@ -328,3 +329,29 @@ def test_a_posterior_is_asked_of_models_that_have_one_alone(
     assert stored(run)["splits"]["test"]["settings"]["scoring"]["masks"] == "model"
     assert found["total"]["ari"] == pytest.approx(scores(run)["total"]["ari"])  # a flip renames components
     assert found["foreground_share"] != scores(run)["foreground_share"]  # but another one is the background
+
+
+def test_what_no_weight_depends_on_can_be_changed(make_run: Make, ask: Ask, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model with two more components, which here are of other weights: the mechanism alone."""
+    run = make_run()
+    ended = ask(f"checkpoint={run}", "model.width=3")
+    assert ended.code == 2
+    assert "model.width = 3 would not fit the trained weights: nothing of this model can be given here." in ended.err
+    built: list[int] = []
+    start = Layers.__init__
+
+    def watched(self: Layers, components: int = 2, width: int = 8, extra: int = 0) -> None:
+        built.append(extra)
+        start(self, components, width)
+
+    monkeypatch.setattr(Layers, "__init__", watched)
+    monkeypatch.setattr(Layers, "changeable", ("extra",))
+    ended = ask(f"checkpoint={run}", "model.width=3")
+    assert "model.width = 3 would not fit the trained weights: only extra can be given here." in ended.err
+    assert ask(f"checkpoint={run}", "model.extra=many").code == 2
+    built.clear()
+    assert ask(f"checkpoint={run}", "pictures=0", "model.extra=5").code == 0
+    assert 5 in built
+    (folder,) = (run / "evaluate").glob("last_test_*")
+    assert stored(folder)["splits"]["test"]["settings"]["model"] == {"extra": 5}
+    assert not (run / "metrics.json").exists()

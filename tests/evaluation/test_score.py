@@ -12,16 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 import yaml
 from jaxtyping import Float
 from torch import Tensor
-from torch.utils.data import DataLoader, Subset
+from torch.utils.data import DataLoader, Subset, default_collate
 
 from apex_lab.base.errors import UserError
 from apex_lab.evaluation import Parts, Predicted, ScoringPart, score, summary
 from apex_lab.evaluation.pictures import choose
+from apex_lab.evaluation.score import predict
 from apex_lab.inference.predictor import Predictor
-from apex_lab.metrics import EvaluatorSettings
+from apex_lab.metrics import Evaluator, EvaluatorSettings
 from apex_lab.metrics.objects import ObjectMetadata, p2d_metadata
 from apex_lab.metrics.page import page
 from apex_lab.scene import Context, Scene
@@ -64,6 +66,39 @@ def test_batch_size_and_order_change_no_digit() -> None:
     ]
     assert found[0]["total"] == pytest.approx(found[1]["total"], rel=1e-12, nan_ok=True)
     assert [row["video"] for row in found[0]["per_video"]] == [row["video"] for row in found[1]["per_video"]]
+
+
+class HalfSize(Layers):
+    """Sees 16 x 16 pixels; the left 5 columns are one component."""
+
+    input_size = (16, 16)
+
+    def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
+        scene = super().forward(video, context)
+        left = torch.zeros_like(scene.masks)
+        left[:, :, 1, :, :5] = 1
+        left[:, :, 0, :, 5:] = 1
+        return dataclasses.replace(scene, masks=left)
+
+
+def test_masks_go_to_the_size_of_the_truth_or_the_truth_to_theirs() -> None:
+    """op3.md section 7: soft masks upsampled before the argmax, or labels shrunk by nearest neighbour."""
+    data = Squares("test", 2, 3, 32, 0)
+    predictor = Predictor(HalfSize(), {}, CPU)
+    batch = default_collate([data[0], data[1]])
+    small = list(predict(predictor, batch, ScoringPart(resize="truth")))
+    large = list(predict(predictor, batch, ScoringPart()))
+    assert small[0].identities.shape == (3, 16, 16)
+    assert large[0].identities.shape == (3, 32, 32)
+    assert (small[0].identities[..., :5] == 1).all()
+    by_hand = Evaluator(ScoringPart().settings(True))
+    for i, predicted in enumerate(small):
+        labels = F.interpolate(data[i]["segmentation"][:, None].double(), size=(16, 16), mode="nearest-exact")[:, 0]
+        by_hand.add(predicted.name, predicted.identities, labels.long().numpy(), None, set(predicted.backgrounds))
+    found = score(predictor, DataLoader(data, batch_size=2), ScoringPart(resize="truth")).evaluator.result()["total"]
+    assert found == pytest.approx(by_hand.result()["total"], nan_ok=True)
+    usual = score(predictor, DataLoader(data, batch_size=2), ScoringPart()).evaluator.result()["total"]
+    assert found["ari"] != pytest.approx(usual["ari"], abs=1e-6)
 
 
 class Labelled(Squares):

@@ -10,7 +10,6 @@ Every check works on a copy of the model. Comparisons are made in float64, where
 from __future__ import annotations
 
 import copy
-import dataclasses
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -43,7 +42,6 @@ class Case:
         schedule: value of each scheduled name; what is left out gets 0.5, or the middle of a range without it.
         without_gradient: names of weights whose gradient is zero for a reason.
         dtype: of comparisons.
-        terms_add: terms of chunks add up to those of the whole; not so where they are means over a video's steps.
     """
 
     model: SceneModel
@@ -52,7 +50,6 @@ class Case:
     schedule: Mapping[str, float] = field(default_factory=dict)
     without_gradient: frozenset[str] = frozenset()
     dtype: torch.dtype = torch.float64
-    terms_add: bool = True
 
     @property
     def name(self) -> str:
@@ -332,10 +329,7 @@ def check_chunks(case: Case) -> None:
             scene = case.chunk(model.eval(), list(range(VIDEOS)), frames, state)
             parts.append(scene)
             state = scene.state
-        joined = _joined(parts)
-        if not case.terms_add:
-            joined = dataclasses.replace(joined, terms=whole.terms)
-        _same(case, joined, whole, f"in chunks of {lengths} frames")
+        _same(case, _joined(parts), whole, f"in chunks of {lengths} frames")
 
 
 def check_ranks(case: Case) -> None:
@@ -467,10 +461,15 @@ def _without_detail(scene: Scene) -> Scene:
 
 
 def _joined(parts: list[Scene]) -> Scene:
-    """Chunks -> the whole: frames one after the other, terms summed."""
+    """Chunks -> the whole: frames one after the other, terms summed, or averaged by the weights that they have."""
     first = parts[0]
     fields = {name: torch.cat([_fields(part)[name] for part in parts], dim=1) for name in _fields(first)}
-    terms = {name: torch.stack([part.terms[name] for part in parts]).sum(dim=0) for name in first.terms}
+    weights = [1.0 if part.terms_weight is None else part.terms_weight for part in parts]
+    total = 1.0 if first.terms_weight is None else sum(weights)
+    terms = {
+        name: sum(part.terms[name] * (weight / total) for part, weight in zip(parts, weights, strict=True))
+        for name in first.terms
+    }
     return _with(first, fields, terms)
 
 

@@ -50,7 +50,6 @@ def case(model: str) -> Case:
         side=side,
         schedule=SCHEDULES.get(model, {}),
         without_gradient=WITHOUT_GRADIENT.get(model, frozenset()),
-        terms_add=model != "op3",  # its terms are weighted means over the steps of a pass
     )
 
 

@@ -77,7 +77,7 @@ class NaiveOp3:
                 weights.append(1.0)
             for j in range(n):
                 colours, logits, mask, density, total, nll, divergence = found
-                loss = (nll + model.beta * divergence).sum() / model.loss_batch
+                loss = (nll + model.beta * divergence).sum() / (model.loss_batch or b)
                 gradients = torch.autograd.grad(
                     loss, [mask, colours, lam1, lam2], create_graph=torch.is_grad_enabled(), retain_graph=True
                 )

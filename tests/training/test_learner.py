@@ -184,8 +184,11 @@ def test_validation_does_not_touch_the_noise_of_training() -> None:
     assert all(torch.equal(a, b) for a, b in zip(often.parameters(), never.parameters(), strict=True))
 
 
-def test_validation_reads_the_values_of_its_step() -> None:
+@pytest.mark.parametrize("at_end", [False, True])
+def test_validation_reads_the_values_of_its_step_or_the_last_ones(at_end: bool) -> None:
     class Seeing(Layers):
+        evaluates_at_end = at_end
+
         def forward(self, video: Tensor, context: Context) -> Scene:
             seen.append((self.training, float(context.schedule["noise"])))
             return super().forward(video, context)
@@ -195,7 +198,8 @@ def test_validation_reads_the_values_of_its_step() -> None:
     schedule = Linear(1.0, 2.0, 10)
     fit(Learner(WeightUpdate(Seeing(), {"noise": schedule}, WEIGHTS, step=2), sgd), 4, interval=3)
     steps = [(True, 2), (False, 3), (True, 3), (True, 4), (True, 5), (False, 6)]
-    assert seen == [(training, pytest.approx(schedule(step))) for training, step in steps]
+    values = [2.0 if at_end and not training else schedule(step) for training, step in steps]
+    assert seen == [(training, pytest.approx(value)) for (training, _), value in zip(steps, values, strict=True)]
 
 
 def test_a_weight_of_zero_takes_a_term_out_even_where_it_is_not_finite() -> None:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from apex_lab.training.schedules import Constant, Cosine, Exponential, Linear, Piecewise, Schedule
+from apex_lab.training.schedules import Constant, Cosine, Curriculum, Exponential, Linear, Piecewise, Schedule
 
 
 def test_constant() -> None:
@@ -61,3 +61,13 @@ def test_exponential_refuses_zero() -> None:
 def test_piecewise_refuses(steps: list[int], values: list[float]) -> None:
     with pytest.raises(ValueError, match="steps"):
         Piecewise(steps=steps, values=values)
+
+
+def test_a_curriculum_draws_uniformly_up_to_a_number_that_grows() -> None:
+    schedule = Curriculum(every=1000, delay=500)
+    assert {schedule(step) for step in range(1500)} == {1.0}
+    assert {schedule(step) for step in range(1500, 2500)} == {1.0, 2.0}
+    drawn = [schedule(step) for step in range(2500, 3500)]
+    assert all(abs(drawn.count(n) - 1000 / 3) < 100 for n in (1.0, 2.0, 3.0))
+    assert drawn == [schedule(step) for step in range(2500, 3500)]
+    assert drawn != [Curriculum(1000, 500, seed=1)(step) for step in range(2500, 3500)]

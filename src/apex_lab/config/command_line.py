@@ -63,8 +63,8 @@ class Command:
         reseeded: the job of another seed of a checked configuration; None where seeds are checked like other jobs.
         literal: keys whose values are names of files, so that their commas, brackets and equals signs mean nothing to
             Hydra; lists in brackets and values in quotes are left to it.
-        any_data: words that set keys of `data` are passed on though no file has such keys, since a checkpoint brings
-            the data's settings; the check knows which exist.
+        of_checkpoint: beginnings of words such as `data.` that are passed on though no file has such keys, since a
+            checkpoint brings these settings; the check knows which exist.
         model_groups: the command composes models, so short names of their groups (`masks=scalor`) are understood.
     """
 
@@ -75,7 +75,7 @@ class Command:
     known: Callable[[Any], Known] | None = None
     reseeded: Callable[[Any, Composed], Any] | None = None
     literal: tuple[str, ...] = ()
-    any_data: bool = False
+    of_checkpoint: tuple[str, ...] = ()
     model_groups: bool = True
 
 
@@ -119,9 +119,7 @@ def launch(command: Command) -> None:
     try:
         with faults.net(), interruptible():
             arrange(command.literal, command.model_groups)
-            if command.any_data:
-                # the checkpoint brings the data's settings, so no file here has them; the check knows which exist
-                sys.argv[1:] = [f"++{word}" if word.startswith("data.") else word for word in sys.argv[1:]]
+            sys.argv[1:] = [f"++{word}" if word.startswith(command.of_checkpoint) else word for word in sys.argv[1:]]
             sweep.items = _preflight(command)
             jobs = [item.words for item in sweep.items]
             task = _Task(Origin.here(f"apex_lab.{command.config_name}", passed_on(), jobs), do, sweep)

@@ -65,10 +65,12 @@ class ClipsPart(_Part):
     Attributes:
         batch_size: clips of the global batch.
         frames: of a clip: null for whole videos, a number, or a schedule.
+        starts: of clips that are shorter than their videos: `random`, or `disjoint`, pieces one after the other.
     """
 
     batch_size: int = Field(ge=1)
     frames: int | dict[str, Any] | None = None
+    starts: Literal["random", "disjoint"] = "random"
 
 
 class EvaluationPart(_Part):

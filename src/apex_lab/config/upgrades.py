@@ -22,6 +22,8 @@ ADDED: dict[str, Any] = {
     "model.motion.bounded": False,  # G-SWM
     "model.unused_parameters": False,  # G-SWM
     "model.untracked": "background",  # SCALOR
+    "model.schedule": "rprp",  # OP3
+    "clips.starts": "random",
 }
 """Keys added since `FORMAT` was raised, with the value that they had before they existed."""
 

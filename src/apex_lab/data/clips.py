@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 from torch.utils.data import Sampler
 
 from apex_lab.base.errors import UserError
 from apex_lab.data.video_set import Clip
+
+Starts = Literal["random", "disjoint"]
+"""Where in their videos clips begin."""
 
 Frames = Callable[[int], int | None]
 """Step -> frames of a clip; None: whole videos."""
@@ -27,6 +31,9 @@ class ClipSampler(Sampler[list[Clip]]):
     to be remembered to resume. Where a clip is shorter than its video, its first frame is drawn from (seed, position
     in the row).
 
+    With `disjoint` starts the row consists of clips that cut each video into pieces one after the other; a rest that is
+    shorter than a clip is left out. So every piece is used equally often.
+
     Args:
         lengths: frames of each video.
         batch_size: clips of the global batch.
@@ -35,6 +42,7 @@ class ClipSampler(Sampler[list[Clip]]):
         frames: clip length at each step.
         views: cameras per video; one is drawn per clip.
         rank, ranks: each rank takes its share of every batch, in order.
+        starts: of clips that are shorter than their videos.
 
     Raises:
         UserError: the batch cannot be shared equally among the ranks, or clips are longer than videos.
@@ -51,6 +59,7 @@ class ClipSampler(Sampler[list[Clip]]):
         views: int = 1,
         rank: int = 0,
         ranks: int = 1,
+        starts: Starts = "random",
     ) -> None:
         if batch_size % ranks:
             raise UserError(f"clips.batch_size = {batch_size} cannot be shared equally among {ranks} processes.")
@@ -58,7 +67,9 @@ class ClipSampler(Sampler[list[Clip]]):
         self.start, self.stop, self.frames, self.views = start, stop, frames, views
         each = batch_size // ranks
         self.mine = slice(rank * each, (rank + 1) * each)
+        self.starts = starts
         self._order = lru_cache(maxsize=2)(self._draw)
+        self._pieces = lru_cache(maxsize=1)(self._cut)
         shortest = min(lengths, default=0)
         for step in range(start, stop) if frames is not whole_videos else ():
             wanted = frames(step)
@@ -81,13 +92,28 @@ class ClipSampler(Sampler[list[Clip]]):
         return max(self.stop - self.start, 0)
 
     def _clip(self, position: int, frames: int | None) -> Clip:
+        if frames is not None and self.starts == "disjoint":
+            return self._piece(position, frames)
         size = len(self.lengths)
-        video = int(self._order(position // size)[position % size])
+        video = int(self._order(position // size, size)[position % size])
         if frames is None and self.views == 1:
             return Clip(video)
         draw = np.random.default_rng([self.seed, position, 1])
         start = 0 if frames is None else int(draw.integers(self.lengths[video] - frames + 1))
         return Clip(video, start, frames, int(draw.integers(self.views)) if self.views > 1 else 0)
 
-    def _draw(self, epoch: int) -> np.ndarray:
-        return np.random.default_rng([self.seed, epoch]).permutation(len(self.lengths))
+    def _piece(self, position: int, frames: int) -> Clip:
+        """The clip at a position of the row of disjoint clips."""
+        pieces = self._pieces(frames)
+        video, start = pieces[int(self._order(position // len(pieces), len(pieces))[position % len(pieces)])]
+        draw = np.random.default_rng([self.seed, position, 1])
+        return Clip(int(video), int(start), frames, int(draw.integers(self.views)) if self.views > 1 else 0)
+
+    def _cut(self, frames: int) -> np.ndarray:
+        """(video, first frame) of all disjoint clips, (N, 2)."""
+        starts = [np.arange(length // frames) * frames for length in self.lengths]
+        videos = np.repeat(np.arange(len(starts)), [len(each) for each in starts])
+        return np.stack([videos, np.concatenate(starts)], axis=1)
+
+    def _draw(self, epoch: int, size: int) -> np.ndarray:
+        return np.random.default_rng([self.seed, epoch]).permutation(size)

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch.utils.data import DataLoader, Subset
 
-from apex_lab.data.clips import ClipSampler, Frames, whole_videos
+from apex_lab.data.clips import ClipSampler, Frames, Starts, whole_videos
 from apex_lab.data.source import VideoSource
 from apex_lab.data.video_set import Item, VideoSet
 
@@ -25,11 +25,12 @@ def training_loader(
     frames: Frames = whole_videos,
     rank: int = 0,
     ranks: int = 1,
+    starts: Starts = "random",
 ) -> Loader:
     """One batch of training clips for each step from `start` up to `stop`; arguments as in `ClipSampler`."""
     videos = source.sets["train"]
     lengths = [videos.length(i) for i in range(len(videos))]
-    batches = ClipSampler(lengths, batch_size, seed, start, stop, frames, videos.views, rank, ranks)
+    batches = ClipSampler(lengths, batch_size, seed, start, stop, frames, videos.views, rank, ranks, starts)
     return DataLoader(videos, batch_sampler=batches, **_options(source.workers))
 
 

@@ -55,6 +55,7 @@ class Request:
     batch_size: int = 4
     chunk: int | None = None
     trust: bool = False
+    model: Mapping[str, Any] = field(default_factory=dict)
 
 
 def load(
@@ -107,7 +108,7 @@ def evaluate_checkpoint(request: Request, file: Path, alone: bool) -> None:
     """
     content, job = load(file, request.paths, request.data, request.trust)
     try:
-        model = trained_model(content["inference"])
+        model = trained_model(content["inference"], request.model)
     except UserError as error:
         raise UserError(sentence(f"{file}: {one_line(error)}")) from error
     if request.scoring.masks == "posterior":
@@ -162,7 +163,10 @@ def _evaluate(
             **{"data": source.describe()},
             **{"checkpoint_sha256": digest, "evaluation": key},
         },
-        settings={"checkpoint": str(file), "split": request.split, "videos": request.videos},
+        settings={
+            **{"checkpoint": str(file), "split": request.split, "videos": request.videos},
+            **({"model": dict(request.model)} if request.model else {}),
+        },
         scoring=request.scoring,
         pictures=request.pictures,
         pictures_by=request.pictures_by,
@@ -211,7 +215,7 @@ def _folder(
         return request.folder if alone else request.folder / of_file
     run = run_folder(file)
     in_run = (run / "run.json").is_file()
-    usual = request.scoring == ScoringPart()
+    usual = request.scoring == ScoringPart() and not request.model
     early = (content["training"] or {}).get("ended", False)  # a callback may end training
     ended = early or content["step"] >= job.config.trainer.max_steps or not model.needs_training
     if in_run and file.name == "last.ckpt" and ended and usual and request.videos is None and not request.data:
@@ -219,13 +223,15 @@ def _folder(
     words = [file.stem if in_run and ended else of_file, request.split]
     words += [] if request.videos is None else [str(request.videos)]
     words += [f"data_{_digest(job.config.data)}"] if request.data else []
-    words += [] if usual else [_digest(request.scoring.model_dump(exclude_defaults=True))]
+    other = {**request.scoring.model_dump(exclude_defaults=True), **({"model": request.model} if request.model else {})}
+    words += [] if usual else [_digest(other)]
     return (run if in_run else Path(request.paths.outputs)) / "evaluate" / "_".join(words)
 
 
 def _key(request: Request, digest: str, data: str, device: torch.device) -> str:
     """Names an evaluation: equal only if everything is equal that can change its results."""
     own = {name: getattr(request, name) for name in ("split", "videos", "pictures", "pictures_by", "export")}
+    own |= {"model": request.model} if request.model else {}
     made_by = {"versions": versions(), "commit": provenance.commit()[0], "device": device.type}
     return _digest({"checkpoint": digest, "data": data, "scoring": request.scoring.model_dump(), **own, **made_by}, 32)
 

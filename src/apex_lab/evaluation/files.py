@@ -13,6 +13,7 @@ from apex_lab.base.validation import one_line, sentence, validate
 from apex_lab.config import components, limits
 from apex_lab.config import schema as config
 from apex_lab.evaluation.other_data import OtherData
+from apex_lab.inference.loading import changed
 from apex_lab.runs import checkpoints
 from apex_lab.runs.checkpoint_files import Bad, find
 
@@ -29,6 +30,7 @@ def look(
     trusted: bool = False,
     batch_size: int = 1,
     chunk: int | None = None,
+    model: Mapping[str, Any] | None = None,
 ) -> tuple[list[Path], Bad]:
     """Tells the files that look like checkpoints, by their configurations alone, from the others.
 
@@ -41,6 +43,7 @@ def look(
         trusted: as of `checkpoints.load`.
         batch_size: videos that will be read at once.
         chunk: frames that the model will see at once; None: all.
+        model: arguments of the model that are to have other values.
 
     Returns:
         Those that can be tried, and the others with their reasons.
@@ -54,6 +57,7 @@ def look(
             content = _glance(file, trusted, _stamp(file))
             stored = here(file, content["config"], paths, trusted)
             _checked(file, stored)
+            changed(stored["model"], model or {})
             node = data.instead_of(stored["data"]) if data else stored["data"]
             if data:
                 components.check(node, "data")

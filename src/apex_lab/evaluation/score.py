@@ -20,6 +20,7 @@ from apex_lab.base.validation import one_line
 from apex_lab.data.video_set import Item, VideoSet
 from apex_lab.evaluation.partial import Parts, Predicted
 from apex_lab.evaluation.scoring import ScoringPart
+from apex_lab.formats.video import fit
 from apex_lab.inference.predictor import Batch, Predictor
 from apex_lab.metrics import Evaluator, EvaluatorSettings, background_identities, scene_identities
 from apex_lab.scene import ABSENT, Scene
@@ -67,6 +68,8 @@ class Tally:
         name = predicted.name
         if videos.labelled:
             labels = videos[predicted.position]["segmentation"].numpy() if truth is None else truth
+            # scoring.resize = truth: no other identities have another size
+            labels = fit(predicted.identities, labels, "truth", name)
             about = videos.metadata(predicted.position)
             try:
                 self.evaluator.add(name, predicted.identities, labels, about, set(predicted.backgrounds))
@@ -158,13 +161,14 @@ def predict(
     Raises:
         UserError: pixels that belong to no identity.
     """
-    scene = predictor(batch)
+    to_truth = scoring.resize == "masks"
+    scene = predictor(batch, full_size=to_truth)
     for look in onlookers:
         look(batch, scene)
     labels = batch.get("segmentation")
-    size = batch["video"].shape[-2:] if labels is None else labels.shape[-2:]
+    size = None if not to_truth else tuple(batch["video"].shape[-2:] if labels is None else labels.shape[-2:])
     try:
-        identities = scene_identities(scene, tuple(size), scoring.min_presence, scoring.presence_after)
+        identities = scene_identities(scene, size, scoring.min_presence, scoring.presence_after)
     except ValueError as error:
         raise UserError(f"The model's output for {batch['name'][0]} cannot be scored: {one_line(error)}.") from error
     backgrounds = background_identities(scene)

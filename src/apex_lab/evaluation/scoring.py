@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from apex_lab.metrics import EvaluatorSettings, TrackingSettings
 from apex_lab.metrics.boundary import TOLERANCE
 
-OF_SCENES = ("min_presence", "presence_after", "masks")
+OF_SCENES = ("min_presence", "presence_after", "masks", "resize")
 """Keys of the way from a `Scene` to identities; files of predictions hold identities."""
 
 
@@ -45,6 +45,8 @@ class ScoringPart(_Part):
             and for files of predictions, else `none`.
         min_presence, presence_after: as in `apex_lab.metrics.scene_identities`.
         masks: `model` scores `Scene.masks`, as the paper does; `posterior` scores `SceneModel.posterior`.
+        resize: of models with an input size of their own: `masks` brings soft masks to the size of the truth before the
+            argmax; `truth` brings the truth to the size of the masks, by nearest neighbour.
     """
 
     tracking: TrackingPart = TrackingPart()
@@ -57,6 +59,7 @@ class ScoringPart(_Part):
     min_presence: float = Field(default=0.5, ge=0, le=1)
     presence_after: bool = False
     masks: Literal["model", "posterior"] = "model"
+    resize: Literal["masks", "truth"] = "masks"
 
     @model_validator(mode="after")
     def _possible(self) -> ScoringPart:

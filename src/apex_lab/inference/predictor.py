@@ -48,12 +48,13 @@ class Predictor:
         self.seed, self.chunk = seed, chunk if model.streams else None
 
     @torch.no_grad()
-    def __call__(self, batch: Batch, detail: bool = False) -> Scene:
+    def __call__(self, batch: Batch, detail: bool = False, full_size: bool = True) -> Scene:
         """The scene of a batch; a model that reads the ground truth gets it.
 
         Args:
             batch: as a loader gives it.
             detail: fill the costly fields of `Scene`.
+            full_size: the scene has the size of the video; False: that of the model's input.
         """
         self.model.eval()
         video = as_float(batch["video"].to(self.device))
@@ -65,11 +66,18 @@ class Predictor:
         scenes: list[Scene] = []
         for start in range(0, video.shape[1], chunk):
             state = scenes[-1].state if scenes else None
-            scenes.append(self.chunk_of(video[:, start : start + chunk], batch["name"], start, state, detail))
+            frames = video[:, start : start + chunk]
+            scenes.append(self.chunk_of(frames, batch["name"], start, state, detail, full_size))
         return joined(scenes)
 
     def chunk_of(
-        self, video: Tensor, names: Sequence[str], first_frame: int = 0, state: Any = None, detail: bool = False
+        self,
+        video: Tensor,
+        names: Sequence[str],
+        first_frame: int = 0,
+        state: Any = None,
+        detail: bool = False,
+        full_size: bool = True,
     ) -> Scene:
         """The scene of consecutive frames.
 
@@ -79,6 +87,7 @@ class Predictor:
             first_frame: index of the first of these frames in its video.
             state: `Scene.state` of the frames before.
             detail: fill the costly fields of `Scene`.
+            full_size: as of a call.
         """
         noise = VideoNoise(self.seed, [number_of(name) for name in names], first_frame)
         context = Context(self.schedule, noise, state, detail or self.posterior)
@@ -87,7 +96,7 @@ class Predictor:
             scene = self.model(small, context)
         if self.posterior:
             scene = dataclasses.replace(scene, masks=self.model.posterior(scene, small, context))
-        return fitted_back(scene, (video.shape[-2], video.shape[-1]))
+        return fitted_back(scene, (video.shape[-2], video.shape[-1])) if full_size else scene
 
 
 def _averaged(found: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
@@ -96,10 +105,23 @@ def _averaged(found: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     return {name: torch.stack([each[name] for each in found if name in each]).mean(0) for name in names}
 
 
+def _terms(scenes: Sequence[Scene]) -> dict[str, Any]:
+    """Loss terms of all chunks' frames, and their weight."""
+    weights = [1.0 if scene.terms_weight is None else scene.terms_weight for scene in scenes]
+    total = None if scenes[-1].terms_weight is None else sum(weights)
+    shares = [weight / (total or 1.0) for weight in weights]
+    terms = {
+        name: torch.stack([scene.terms[name] * share for scene, share in zip(scenes, shares, strict=True)]).sum(0)
+        for name in scenes[-1].terms
+    }
+    return {"terms": terms, "terms_weight": total}
+
+
 def joined(scenes: Sequence[Scene]) -> Scene:
     """Scenes of consecutive chunks of the same videos -> the scene of all their frames.
 
-    Loss terms are summed; diagnostics, which describe a chunk, are averaged over chunks.
+    Loss terms are summed, or averaged by `Scene.terms_weight`; diagnostics, which describe a chunk, are averaged over
+    chunks.
     """
     if len(scenes) == 1:
         return scenes[0]
@@ -112,7 +134,7 @@ def joined(scenes: Sequence[Scene]) -> Scene:
     names = ("masks", "ids", "presence", "appearance", "reconstruction", "windows", "means")
     return Scene(
         background=last.background,
-        terms={name: torch.stack([scene.terms[name] for scene in scenes]).sum(0) for name in last.terms},
+        **_terms(scenes),
         diagnostics=_averaged([scene.diagnostics for scene in scenes]),
         state=last.state,
         **{name: over_time(name) for name in names},

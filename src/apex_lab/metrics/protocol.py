@@ -9,9 +9,9 @@ is one object for the whole video. In P2D the robot arm is an object (label 1), 
 A model gives soft masks that sum to 1 over its components, and an identity per component and frame (−1: absent). The
 prediction is one identity per pixel:
 
-1. Masks of another size than the ground truth are resized to it, bilinearly, before the argmax (models here always;
-   files of predictions with `resize=masks`). `resize=truth` brings the ground truth to the size of the prediction by
-   nearest neighbour instead. Without `resize`, files of another size are refused.
+1. Masks of another size than the ground truth are resized to it, bilinearly, before the argmax (models by default,
+   files of predictions with `resize=masks`). `scoring.resize=truth`, or `resize=truth` of files, brings the truth to
+   the size of the prediction by nearest neighbour instead. Without `resize`, files of another size are refused.
 2. Object components with a presence below `scoring.min_presence` (0.5) are taken out before the argmax, so their
    pixels go to the next best component. With `scoring.presence_after` they are taken out after it, and their pixels
    form one segment of nothing. Background components are never taken out.

@@ -70,6 +70,7 @@ def segmenter_of(
     full_size: bool = True,
     detail: bool = False,
     labels: bool = False,
+    changes: Mapping[str, Any] | None = None,
 ) -> Segmenter:
     """The model of a checkpoint that has been read.
 
@@ -79,13 +80,14 @@ def segmenter_of(
         device: where the model runs.
         fit, full_size, detail: as of `load`.
         labels: models that read the ground truth are allowed.
+        changes: arguments of the model with other values than in the checkpoint, as of `trained_model`.
 
     Raises:
         UserError: the model cannot be built, or reads the ground truth.
     """
     inference = content["inference"]
     try:
-        model = trained_model(inference)
+        model = trained_model(inference, changes)
     except UserError as error:
         raise UserError(sentence(f"{file}: {one_line(error)}")) from error
     if model.needs_labels and not labels:

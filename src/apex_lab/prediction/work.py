@@ -9,7 +9,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
@@ -56,10 +56,11 @@ class Wanted:
 
 @dataclass(frozen=True)
 class Weights:
-    """Which model it is: its checkpoint file and that file's SHA-256."""
+    """Which model it is: its checkpoint file, that file's SHA-256, and arguments that have other values than there."""
 
     file: Path
     sha256: str
+    changes: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -100,6 +101,7 @@ class VideoPrediction:
             **{"video": self.video.stamp(), "checkpoint": self.weights.sha256, "fit": self.segmenter.fit},
             **{"wanted": asdict(self.wanted), "device": self.segmenter.predictor.device.type},
             **{"version": apex_lab.__version__},
+            **({"model": dict(self.weights.changes)} if self.weights.changes else {}),
         }
         return hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()[:32]
 
@@ -292,7 +294,7 @@ class VideoPrediction:
             "framing": self.view.described(),
             "model": type(model).__name__,
             "checkpoint": {"file": str(self.weights.file), "sha256": self.weights.sha256},
-            "settings": asdict(wanted),
+            "settings": {**asdict(wanted), **({"model": dict(self.weights.changes)} if self.weights.changes else {})},
             "files": [output.name for output in self.outputs],
             "notes": notes,
             "device": segmenter.predictor.device.type,

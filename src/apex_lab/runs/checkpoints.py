@@ -37,6 +37,7 @@ from apex_lab.config.schema import Config, build_schedules
 from apex_lab.config.upgrades import FORMAT, upgraded
 from apex_lab.runs.record import Kept
 from apex_lab.scene import SceneModel
+from apex_lab.training.schedules import in_evaluation
 
 _KEYS = {
     1: {"format", "step", "weights", "config", "choices", "training"},
@@ -53,7 +54,7 @@ def inference_part(config: Config, model: SceneModel, step: int) -> dict[str, An
     return {
         "model": config.model,
         "weights": {name: value.detach().cpu() for name, value in model.state_dict().items()},
-        "schedule": {name: float(schedule(step)) for name, schedule in build_schedules(config).items()},
+        "schedule": in_evaluation(build_schedules(config), model, step),
         "attributes": {name: getattr(model, name) for name in ATTRIBUTES},
         "precision": config.trainer.precision,
         "seed": config.seed,

@@ -258,6 +258,8 @@ def _scoring(scored: Mapping[str, Any], content: Mapping[str, Any]) -> str:
         scoring = {key: value for key, value in scoring.items() if key != "identities"}
     if isinstance(scoring, dict) and scoring.get("masks") == "model":  # what earlier versions did without saying so
         scoring = {key: value for key, value in scoring.items() if key != "masks"}
+    if isinstance(scoring, dict) and scoring.get("resize") == "masks":  # likewise
+        scoring = {key: value for key, value in scoring.items() if key != "resize"}
     if isinstance(scoring, dict) and scoring.get("first_frame") == 0:  # likewise
         scoring = {key: value for key, value in scoring.items() if key != "first_frame"}
     return json.dumps(scoring, sort_keys=True)

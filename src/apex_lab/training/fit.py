@@ -106,6 +106,7 @@ def fit(
         build_clip_frames(config),
         ranks.rank,
         ranks.world,
+        config.clips.starts,
     )
     validation = whole_loader(
         source.sets["val"],

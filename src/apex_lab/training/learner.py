@@ -16,7 +16,7 @@ from typing import Any
 import lightning as L
 import torch
 import torch.distributed as dist
-from torch import nn
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from apex_lab.base.errors import UserError
@@ -26,7 +26,9 @@ from apex_lab.evaluation.score import Onlooker, Tally, add_batch, video_set
 from apex_lab.evaluation.scoring import ScoringPart
 from apex_lab.inference.predictor import Batch, Predictor
 from apex_lab.metrics.keys import VALIDATION_SCORES
+from apex_lab.scene import SceneModel, schedule_at
 from apex_lab.training import watch
+from apex_lab.training.schedules import in_evaluation
 from apex_lab.training.update import WeightUpdate, named_parameters, remember_rates
 from apex_lab.training.watch import Seen, Watch
 
@@ -177,8 +179,12 @@ class Learner(L.LightningModule):
         model = self.update.model
         self._tally = Tally.empty(self._scoring.settings(model.tracks))
         self._predictor = Predictor(
-            model, self.update.schedules.tensors(), self.device, self.update.precision, seed=self.update.seed
+            model, self._in_evaluation(model), self.device, self.update.precision, seed=self.update.seed
         )
+
+    def _in_evaluation(self, model: SceneModel) -> dict[str, Tensor]:
+        """The scheduled values of validation."""
+        return schedule_at(in_evaluation(self.update.schedules.schedules, model, self.step), self.device)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         assert self._tally is not None

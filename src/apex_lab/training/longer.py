@@ -29,6 +29,7 @@ from apex_lab.runs.identity import stored_configuration, with_same_words
 from apex_lab.runs.state import has_scores, read_state
 from apex_lab.scene import SceneModel
 from apex_lab.training.loggers import Curves
+from apex_lab.training.schedules import in_evaluation
 
 Number = Callable[[int], float | None]
 
@@ -165,22 +166,25 @@ def take_over(run: Run, found: Sequence[Shorter], model: SceneModel) -> dict[str
         except (_NotSo, UserError) as why:
             console.say(_told(shorter, why))
             continue
-        _put(run, shorter, last, best)
+        _put(run, shorter, last, best, model)
         return checkpoints.load(run.last, known=known)
     console.say(ANEW)
     return None
 
 
-def _put(run: Run, shorter: Shorter, last: Mapping[str, Any], best: Mapping[str, Any] | None) -> None:
+def _put(
+    run: Run, shorter: Shorter, last: Mapping[str, Any], best: Mapping[str, Any] | None, model: SceneModel
+) -> None:
     step, training = last["step"], last["training"]
     console.say(f"going on from step {step} of {shorter.folder}, which stays as it is")
     about = {"folder": str(shorter.folder), "step": step}
     _copy_curves(shorter.folder / run.curves_file.name, run.curves_file, step, run.job.config)
     if best is not None:
-        checkpoints.save(run.best, _as_own(best, run.job))
+        checkpoints.save(run.best, _as_own(best, run.job, model))
     kept = {"foreground_share": training.get("record", {}).get("foreground_share"), "continues": about}
     early = bool(training["ended"]) and step < shorter.steps  # a callback has ended it, as it would end the longer run
-    checkpoints.save(run.last, {**_as_own(last, run.job), "training": {**training, "ended": early, "record": kept}})
+    own = {**training, "ended": early, "record": kept}
+    checkpoints.save(run.last, {**_as_own(last, run.job, model), "training": own})
 
 
 def _check(last: Mapping[str, Any], shorter: Shorter, run: Run, model: SceneModel) -> None:
@@ -205,9 +209,9 @@ def _check(last: Mapping[str, Any], shorter: Shorter, run: Run, model: SceneMode
         raise _NotSo(f"callbacks with a state of their own ({names}) may have ended the longer run at that step")
 
 
-def _as_own(content: Mapping[str, Any], job: Job) -> dict[str, Any]:
+def _as_own(content: Mapping[str, Any], job: Job, model: SceneModel) -> dict[str, Any]:
     """A checkpoint as the run of another job would have stored it."""
-    schedule = {name: float(value(content["step"])) for name, value in build_schedules(job.config).items()}
+    schedule = in_evaluation(build_schedules(job.config), model, content["step"])
     inference = {**content["inference"], "model": job.config.model, "schedule": schedule}
     own = {"inference": inference, "config": job.raw, "choices": job.choices}
     return {**{key: value for key, value in content.items() if key != "format"}, **own}

@@ -9,10 +9,14 @@ from __future__ import annotations
 import itertools
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
 from pydantic import Field
+
+from apex_lab.nn.noise import mixed
+from apex_lab.scene import SceneModel
 
 Steps = Annotated[int, Field(ge=0)]
 
@@ -23,6 +27,16 @@ class Schedule(ABC):
     @abstractmethod
     def __call__(self, step: int) -> float:
         """The value that the batch after `step` weight updates is trained with."""
+
+
+END = 100_000_000
+"""A step at which schedules have their last value; the published evaluation of SPACE passes it (space.md section 8)."""
+
+
+def in_evaluation(schedules: Mapping[str, Callable[[int], float]], model: SceneModel, step: int) -> dict[str, float]:
+    """The scheduled values that validation and evaluation call a model with after `step` weight updates."""
+    at = END if model.evaluates_at_end else step
+    return {name: float(schedule(at)) for name, schedule in schedules.items()}
 
 
 @dataclass(frozen=True)
@@ -144,3 +158,24 @@ class Staircase(Schedule):
 
     def __call__(self, step: int) -> float:
         return float(self.values[sum(step > milestone for milestone in self.milestones)])
+
+
+@dataclass(frozen=True)
+class Curriculum(Schedule):
+    """A whole number drawn anew for every step, uniform from 1 to a largest one.
+
+    The largest is 1 up to `delay` and grows by 1 every `every` steps after it.
+
+    Args:
+        every: steps.
+        delay: steps.
+        seed: of the draws; a number depends on it and on the step alone.
+    """
+
+    every: Annotated[int, Field(gt=0)]
+    delay: Steps = 0
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    def __call__(self, step: int) -> float:
+        largest = 1 + max(0, step - self.delay) // self.every
+        return float(1 + mixed(self.seed, step) % largest)

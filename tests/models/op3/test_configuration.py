@@ -8,7 +8,9 @@ import pytest
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from apex_lab.config.schema import build_model
 from apex_lab.models.op3 import Op3
+from tests.conftest import compose_job
 
 CONF = Path(__file__).parents[3] / "conf"
 
@@ -21,7 +23,7 @@ def composed(*files: str) -> DictConfig:
 
 
 @pytest.mark.parametrize("recipe", ["paper", "cpu", "quickstart", "smoke"])
-@pytest.mark.parametrize("experiment", [[], ["experiment/op3_original"]])
+@pytest.mark.parametrize("experiment", [[], ["experiment/op3_original"], ["experiment/op3_curriculum_original"]])
 def test_recipes(recipe: str, experiment: list[str]) -> None:
     config = composed("model/op3", f"recipe/op3/{recipe}", *experiment)
     model = instantiate(config.model)
@@ -29,7 +31,7 @@ def test_recipes(recipe: str, experiment: list[str]) -> None:
     assert model.input_size == (config.model.image_size,) * 2
     assert tuple(config.loss) == Op3.term_names
     assert config.loss.kl == model.beta
-    assert set(config.schedule) == set(Op3.schedule_ranges)
+    assert set(config.schedule) == set(model.schedule_ranges)
     assert instantiate(config.optimizer, params=model.parameters()).param_groups[0]["lr"] == 3e-4
 
 
@@ -39,3 +41,23 @@ def test_defaults_are_the_papers() -> None:
     for name in ("input_size", "slots", "sigma", "beta", "loss_batch", "plan"):
         assert getattr(model, name) == getattr(default, name), name
     assert {n: p.shape for n, p in model.named_parameters()} == {n: p.shape for n, p in default.named_parameters()}
+
+
+@pytest.mark.parametrize(
+    ("name", "slots", "schedule", "frames", "epochs"),
+    [("op3_original", 7, "single_step_physics", 2, 150), ("op3_curriculum_original", 4, "curriculum", 5, 300)],
+)
+def test_the_original_experiments(name: str, slots: int, schedule: str, frames: int, epochs: int) -> None:
+    """op3.md section 6, column [O]; an epoch takes every disjoint clip of the data once."""
+    config = compose_job("model=op3", "scale=paper", "data=sprites", f"+experiment={name}").config
+    model = build_model(config)
+    assert isinstance(model, Op3)
+    assert (model.slots, model.plan.schedule, model.plan.first, model.plan.weighting) == (slots, schedule, 4, "linear")
+    assert (model.loss_batch, config.clips.batch_size, config.clips.frames) == (None, 80, frames)
+    clips = config.data["train"] * (config.data["frames"] // frames)
+    assert config.trainer.max_steps == epochs * clips / 80
+    if schedule == "curriculum":  # up to one more every 10 epochs after epoch 100
+        node, epoch = config.schedule["predictions"], clips // 80
+        assert (node["delay"], node["every"]) == (100 * epoch, 10 * epoch)
+    else:  # T = 5 steps
+        assert len(model.plan.training_steps(frames)) == 5

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import weakref
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
+from apex_lab.inference.predictor import joined
 from apex_lab.models.op3 import Op3
+from apex_lab.models.op3.decoder import Decoded, Decoder
+from apex_lab.models.op3.posterior import RawGaussian
+from apex_lab.models.op3.refinement import Memory, Refinement, Seen
 from apex_lab.nn.noise import VideoNoise
 from apex_lab.scene import Context, Scene
 from tests.reference.op3 import NaiveOp3
@@ -61,14 +68,49 @@ def test_the_naive_twin_agrees(weighting: str, first: int, later: int, video: Te
         assert float((found[name] - gradient).abs().max()) <= 2e-3 * float(gradient.abs().max()) + 1e-6 * largest, name
 
 
+def test_without_a_number_the_loss_is_divided_by_the_batch(video: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    """op3.md section 4: dL/dm = -p / (P + 1e-12) / B and dL/dx = m p / (P + 1e-12) (x - y) / (3 sigma^2) / B."""
+    seen: list[Seen] = []
+    refine = Refinement.forward
+
+    def watched(self: Refinement, looked_at: Seen, memory: Memory) -> tuple[RawGaussian, Memory]:
+        seen.append(looked_at)
+        return refine(self, looked_at, memory)
+
+    monkeypatch.setattr(Refinement, "forward", watched)
+    torch.manual_seed(0)
+    model = Op3(SIZE, 3, 8, 4, 16, loss_batch=None)
+    assert model.batch_statistics  # a share of the batch has another size
+    assert not Op3(SIZE, 3, 8, 4, 16).batch_statistics
+    for training, batch in ((True, 2), (False, 1)):
+        seen.clear()
+        model.train(training)(video, context())
+        for step in seen:
+            masks, density, total = step.mixture
+            to_masks = -density / (total + 1e-12)[:, None] / batch
+            torch.testing.assert_close(step.gradients.masks, to_masks)
+            errors = step.colours - step.image[:, None]
+            to_colours = -(masks * to_masks)[:, :, None] * errors / (3 * 0.1**2)
+            torch.testing.assert_close(step.gradients.colours, to_colours)
+
+
 def test_evaluation_is_the_same_computation_without_a_graph(model: Op3, video: Tensor) -> None:
     trained = model(video, context())
-    evaluated = model.eval()(video, context())
+    with torch.no_grad():
+        evaluated = model.eval()(video, context())
     assert trained.masks.requires_grad
     assert not evaluated.masks.requires_grad
     torch.testing.assert_close(evaluated.masks, trained.masks.detach())
     with torch.no_grad():
         torch.testing.assert_close(model.train()(video, context()).masks, evaluated.masks)
+
+
+def test_evaluation_mode_has_gradients_where_they_are_on(model: Op3, video: Tensor) -> None:
+    loss(model(video, context())).backward()
+    wanted = gradients(model)
+    loss(model.eval()(video, context())).backward()
+    for name, gradient in gradients(model).items():
+        torch.testing.assert_close(gradient, wanted[name])
 
 
 def test_scene(model: Op3, video: Tensor) -> None:
@@ -97,13 +139,43 @@ def test_chunks_give_what_the_whole_gives(model: Op3, video: Tensor, cut: int) -
     second = model(video[:, cut:], context(cut, state=first.state))
     torch.testing.assert_close(torch.cat([first.masks, second.masks], 1), whole.masks)
     torch.testing.assert_close(torch.cat([first.appearance, second.appearance], 1), whole.appearance)
-    # terms are weighted means over steps: those of the chunks by the sums of their weights
-    before, after = (sum(s.weight for s in model.plan.steps(n, b)) for n, b in ((cut, 0), (4 - cut, cut)))
-    for name, term in whole.terms.items():
-        chunks = (first.terms[name] * before + second.terms[name] * after) / (before + after)
-        torch.testing.assert_close(chunks, term)
+    together = joined([first, second])
+    torch.testing.assert_close(together.terms, whole.terms)
+    assert together.terms_weight == pytest.approx(whole.terms_weight)
     assert second.state.frames == 4
     torch.testing.assert_close(second.state.sample, whole.state.sample)
+
+
+def test_the_weight_of_the_terms_is_the_sum_of_the_steps_weights(model: Op3, video: Tensor) -> None:
+    """Four refinements, then three times a prediction and two refinements (op3.md section 6)."""
+    assert model.eval()(video, context()).terms_weight == 2.5 + 3 * 2.5
+
+
+@pytest.mark.parametrize("frames", [3, 9])
+def test_evaluation_keeps_no_more_of_a_frame_than_its_result(
+    model: Op3, frames: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the decoder's hidden layers, at most those of two steps are alive at any time, however long the video."""
+    hidden: list[weakref.ref[Tensor]] = []
+    alive: list[int] = []
+    decode = Decoder.forward
+
+    def watched(self: Decoder, *inputs: Any) -> Decoded:
+        decoded = decode(self, *inputs)
+        hidden.extend(weakref.ref(layer) for layer in decoded.hidden)
+        alive.append(sum(layer() is not None for layer in hidden))
+        return decoded
+
+    monkeypatch.setattr(Decoder, "forward", watched)
+    video = torch.rand(1, frames, 3, SIZE, SIZE)
+    with torch.no_grad():
+        scene = model.eval()(video, context(videos=(5,), detail=True))
+    assert max(alive) == 2 * 4
+    assert not any(layer() is not None for layer in hidden)
+    # the result's tensors hold no larger ones that they are parts of
+    for value in (scene.masks, scene.reconstruction, scene.means, scene.appearance):
+        assert value is not None
+        assert value.untyped_storage().nbytes() == value.numel() * value.element_size()
 
 
 def test_a_video_does_not_depend_on_its_company(model: Op3, video: Tensor) -> None:
@@ -166,3 +238,30 @@ def test_other_image_sizes_are_refused(model: Op3) -> None:
 
 def test_state_dict_holds_parameters_alone(model: Op3) -> None:
     assert set(model.state_dict()) == {name for name, _ in model.named_parameters()}
+
+
+@pytest.mark.parametrize("schedule", ["single_step_physics", "curriculum"])
+def test_other_schedules_train_and_evaluation_refines_every_frame(schedule: str, model: Op3, video: Tensor) -> None:
+    torch.manual_seed(0)
+    other = Op3(SIZE, 3, 8, 4, 16, schedule=schedule)  # type: ignore[arg-type]
+    assert set(other.schedule_ranges) == ({"predictions"} if schedule == "curriculum" else set())
+    values = {name: torch.tensor(2.0) for name in other.schedule_ranges}
+    scene = other(video, context(schedule=values))
+    assert scene.masks.shape == (2, 4, 3, SIZE, SIZE)
+    torch.testing.assert_close(scene.masks.sum(2), torch.ones(2, 4, SIZE, SIZE))
+    # the first frame's ramp of four refinements, and two or three predictions; one refinement after two
+    assert scene.terms_weight == pytest.approx(2.5 + 3)
+    loss(scene).backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in other.parameters())
+    torch.testing.assert_close(other.eval()(video, context()).masks, model.eval()(video, context()).masks)
+
+
+def test_frames_beyond_the_curriculum_change_no_gradient(model: Op3, video: Tensor) -> None:
+    curriculum = Op3(SIZE, 3, 8, 4, 16, schedule="curriculum")
+    found = []
+    for frames in (2, 4):
+        loss(curriculum(video[:, :frames], context(schedule={"predictions": torch.tensor(1.0)}))).backward()
+        found.append(gradients(curriculum))
+    assert found[0].keys() == found[1].keys()
+    for name, gradient in found[0].items():
+        torch.testing.assert_close(found[1][name], gradient)

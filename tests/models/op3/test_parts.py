@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,7 @@ from apex_lab.models.op3 import Op3
 from apex_lab.models.op3.decoder import Decoder
 from apex_lab.models.op3.dynamics import Dynamics
 from apex_lab.models.op3.likelihood import image_gradients, mixture
-from apex_lab.models.op3.plan import Plan
+from apex_lab.models.op3.plan import Plan, listed
 from apex_lab.models.op3.posterior import UNIT_RAW, RawGaussian, kl, parameter_gradients, variance_of
 from apex_lab.models.op3.refinement import ImageNorm, VectorNorm, _PooledElu
 from apex_lab.nn.tiled_conv import TiledConv, coordinate_maps
@@ -176,6 +178,63 @@ def test_plan(name: str, frames: int, later: int, weighting: str) -> None:
     assert [(step.kind, step.weight) for step in chunks] == [(step.kind, step.weight) for step in steps]
 
 
+@pytest.mark.parametrize("name", sorted({n.removesuffix("_kind") for n in ARRAYS.files if n.endswith("_kind")}))
+def test_published_schedules(name: str) -> None:
+    """The name of each array gives frames, refinements per frame, weighting, and a cap."""
+    words = re.fullmatch(r"sched/[a-z]+(\d+)_r(\d+)_(?:(segment|linear)|capped_at_(\d+)_frames)", name)
+    assert words is not None
+    frames, later, weighting, cap = words.groups()
+    found = listed("rprp", 4, int(later), int(frames), weighting or "segment", None if cap is None else int(cap))  # type: ignore[arg-type]
+    assert [int(kind == "dynamics") for kind in found.kinds] == ARRAYS[f"{name}_kind"].tolist()
+    assert found.weights == pytest.approx(ARRAYS[f"{name}_weight"].tolist())
+    if f"{name}_readout" in ARRAYS:
+        assert found.readout == ARRAYS[f"{name}_readout"].tolist()
+
+
+def test_a_capped_schedule_reads_the_last_frame_after_its_last_step() -> None:
+    assert listed("rprp", 4, 2, 5, "segment", available=3).readout == [3, 6, 15]
+
+
+R, D = "refine", "dynamics"
+
+
+def test_single_step_physics_predicts_to_the_end() -> None:
+    """op3.md section 6: s refinements, then dynamics; the length is that of the list."""
+    found = listed("single_step_physics", 4, 2, 7, "linear")
+    assert found.kinds == [R, R, R, R, D, D, D]
+    assert found.weights == [1, 2, 3, 4, 5, 6, 7]
+    assert found.readout == [3, 4, 5, 6]
+    assert listed("single_step_physics", 4, 2, 7, "segment", available=2).kinds == [R, R, R, R, D, R, R]
+    assert listed("single_step_physics", 4, 2, 3, "segment").kinds == [R, R, R]
+
+
+def test_curriculum_predicts_n_frames_and_refines_once() -> None:
+    found = listed("curriculum", 2, 9, 99, "segment", predictions=3)
+    assert found.kinds == [R, R, D, D, D, R]
+    assert found.weights == [0.5, 1, 1, 1, 1, 1]
+    assert found.readout == [1, 2, 3, 5]
+    assert listed("curriculum", 2, 9, 99, "segment", available=2, predictions=3).kinds == [R, R, D, R, R, R]
+
+
+def test_frames_that_a_schedule_does_not_reach_are_predicted_and_count_nothing() -> None:
+    steps = Plan(1, 2, "linear", "curriculum").training_steps(4, predictions=1)
+    assert [(step.kind, step.frame, step.weight) for step in steps] == [
+        (R, 0, 1.0),
+        (D, 1, 2.0),
+        (R, 1, 3.0),
+        (D, 2, 0.0),
+        (D, 3, 0.0),
+    ]
+
+
+@pytest.mark.parametrize("schedule", ["rprp", "single_step_physics", "curriculum"])
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_every_frame_of_a_clip_has_a_step(schedule: str, frames: int) -> None:
+    for predictions in (1, 3, 9):
+        steps = Plan(2, 1, "segment", schedule).training_steps(frames, predictions)  # type: ignore[arg-type]
+        assert sorted({step.frame for step in steps}) == list(range(frames))
+
+
 def test_without_later_refinements_a_clip_is_predicted() -> None:
     steps = Plan(2, 0, "segment").steps(3)
     assert [(step.kind, step.frame) for step in steps] == [
@@ -205,6 +264,54 @@ def test_parameter_counts() -> None:
     assert count(dynamics) == 280_417
     assert count(model.decoder) == 184_132
     assert count(model) == 876_305
+
+
+NAMES = {
+    "initial_deter_state": "start_deterministic",
+    "initial_lambdas1": "start_mean",
+    "initial_lambdas2": "start_raw",
+    "refinement_net.conv_layers.": "refinement.convs.",
+    "refinement_net.fc_layers.0.": "refinement.compress.",
+    "refinement_net.lstm.": "refinement.lstm.",
+    "refinement_net.last_fc.": "refinement.to_mean.",
+    "refinement_net.last_fc2.": "refinement.to_raw.",
+    "dynamics_net.inertia_encoder.": "dynamics.inertia.",
+    "dynamics_net.pairwise_encoder_network.": "dynamics.pair.",
+    "dynamics_net.interaction_effect_network.": "dynamics.effect.",
+    "dynamics_net.interaction_attention_network.": "dynamics.attention.",
+    "dynamics_net.final_merge_network.": "dynamics.merge.",
+    "dynamics_net.det_output.": "dynamics.to_deterministic.",
+    "dynamics_net.lambdas1_output.": "dynamics.to_mean.",
+    "dynamics_net.lambdas2_output.": "dynamics.to_raw.",
+    "decode_net.broadcast_net.conv_layers.0.": "decoder.first.",
+    **{f"decode_net.broadcast_net.conv_layers.{i + 1}.": f"decoder.others.{i}." for i in range(4)},
+    "layer_norms_2d.0.": "refinement.norm_masks.",
+    "layer_norms_2d.1.": "refinement.norm_density.",
+    "layer_norms_2d.2.": "refinement.norm_others.",
+    "layer_norms_2d.3.": "refinement.norm_colours.",
+    "layer_norms_1d.0.": "refinement.norm_mean.",
+    "layer_norms_1d.1.": "refinement.norm_raw.",
+}
+"""Beginnings of the published names of weights -> of ours."""
+
+ENDS = {"fcs.0.": "0.", "last_fc.": "2.", "_l0": "", "gamma": "scale", "beta": "shift", "scale_param": "scale"}
+
+
+def own_name(published: str) -> str:
+    """Our name of a published weight."""
+    start = max((start for start in NAMES if published.startswith(start)), key=len)
+    rest = published.removeprefix(start)
+    for theirs, ours in {**ENDS, "center_param": "shift"}.items():
+        rest = rest.replace(theirs, ours)
+    return NAMES[start] + rest
+
+
+def test_all_published_weights_have_a_place() -> None:
+    """Names and shapes of the published networks with S = R = 4 and images of 8 x 8."""
+    wanted = json.loads((Path(__file__).parent / "fixtures" / "weights.json").read_text())
+    found = {name: list(weight.shape) for name, weight in Op3(8, 3, 4, 4, 128).named_parameters()}
+    assert found == {own_name(name): shape for name, shape in wanted.items()}
+    assert len(found) == len(wanted) == 73
 
 
 def test_initial_weights() -> None:

@@ -122,6 +122,18 @@ def test_tokens_are_normalised_one_by_one(published: dict[str, Tensor]) -> None:
     found = encoder.tokens(published["enc/features"])
     close(found, published["enc/tokens_eps1e-3"])
     assert (found - published["enc/WRONG_tokens_groupnorm"]).abs().max() > 0.01
+    # PyTorch's epsilon, which other implementations have, gives other numbers (slot_attention.md section 8)
+    encoder.norm.eps = 1e-5
+    with np.load(Path(__file__).parent / "fixtures" / "epsilon.npz", allow_pickle=False) as arrays:
+        others = torch.from_numpy(arrays["enc/tokens_eps1e-5"])
+    close(encoder.tokens(published["enc/features"]), others)
+    assert (found - others).abs().max() > 1e-4
+
+
+def test_a_model_in_double_precision_has_a_scene_in_it() -> None:
+    scene = evaluate(tiny().double(), video().double())
+    for name in ("masks", "presence", "appearance", "reconstruction"):
+        assert getattr(scene, name).dtype == torch.float64, name
 
 
 def test_learning_rate(published: dict[str, Tensor]) -> None:

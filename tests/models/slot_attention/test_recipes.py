@@ -58,3 +58,9 @@ def test_the_paper_s_recipe_is_the_released_model() -> None:
 def test_the_original_experiment() -> None:
     config = composed("paper", "+experiment=slot_attention_original")
     assert (config["model"]["slots"], config["clips"]["batch_size"], config["trainer"]["max_steps"]) == (7, 64, 500_000)
+    model = build(config["model"], "model")
+    assert (model.iterations, model.input_size) == (3, (128, 128))
+    assert sum(p.numel() for p in model.parameters()) == 890_308
+    assert config["optimizer"] == {"_target_": "torch.optim.Adam", "lr": 4e-4}
+    assert (config["lr_scale"]["warmup"], config["lr_scale"]["half_life"]) == (10_000, 100_000)
+    assert config["trainer"]["gradient_clip_norm"] is None

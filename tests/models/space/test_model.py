@@ -187,3 +187,20 @@ def test_wrong_sizes_are_named(model: Space) -> None:
         Space(grid=2)
     with pytest.raises(ValueError, match=r"model.image_size=96 must be a power of two"):
         Space(image_size=96)
+
+
+def test_a_cell_with_a_presence_of_one_half_is_absent() -> None:
+    """space.md section 10: an object exists where the probability is above 0.5."""
+    model = small(grid=4).eval()
+    with torch.no_grad():
+        for parameter in model.foreground.presence.parameters():
+            parameter.zero_()  # q(pres) = sigmoid(0)
+    scene = model(video(), context())
+    assert float(scene.presence[..., :-1].max()) == pytest.approx(0.5)
+    assert (scene.segmentation() == 0).all()
+    assert float(scene.diagnostics["live_objects"]) == 0
+    with torch.no_grad():
+        model.foreground.presence.bias.fill_(1e-5)
+    scene = model(video(), context())
+    assert (scene.presence >= 0.5).all()
+    assert float(scene.diagnostics["live_objects"]) == 16

@@ -124,7 +124,7 @@ class SpritesSource(RecordedSource):
         test: Annotated[int, Field(ge=0)] = 200,
         frames: Annotated[int, Field(gt=0)] = 20,
         image_size: Annotated[int, Field(ge=16, le=1024)] = 128,
-        min_objects: Annotated[int, Field(ge=0)] = 1,
+        min_objects: Annotated[int, Field(ge=0)] = 2,
         max_objects: Annotated[int, Field(ge=1, le=len(COLOURS))] = 4,
         workers: Annotated[int, Field(ge=0)] = 2,
         stored: bool = False,

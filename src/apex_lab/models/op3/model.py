@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from apex_lab.models.op3.decoder import Decoded, Decoder
 from apex_lab.models.op3.dynamics import Dynamics
 from apex_lab.models.op3.likelihood import ImageGradients, Mixture, image_gradients, mixture
-from apex_lab.models.op3.plan import Plan, PlannedStep, Weighting
+from apex_lab.models.op3.plan import Plan, PlannedStep, ScheduleKind, Weighting
 from apex_lab.models.op3.posterior import UNIT_RAW, RawGaussian, kl, parameter_gradients
 from apex_lab.models.op3.refinement import Memory, Refinement, Seen
 from apex_lab.nn.tiled_conv import TiledWeights
@@ -68,6 +68,22 @@ class Rendered(NamedTuple):
     mixture: Mixture
 
 
+class Shown(NamedTuple):
+    """What the `Scene` holds of a frame: all that is kept of it, so that memory grows by no more than the result.
+
+    Attributes:
+        masks: (B, K, H, W).
+        reconstruction: RGB in [0, 1], (B, 3, H, W).
+        appearance: d and the posterior's mean, not the sample: appearances are compared with one another. (B, K, R + S)
+        means: each slot's RGB in [0, 1], (B, K, 3, H, W); None unless asked for.
+    """
+
+    masks: Tensor
+    reconstruction: Tensor
+    appearance: Tensor
+    means: Tensor | None
+
+
 class Op3(SceneModel):
     """Object-centric perception, prediction and planning, without actions.
 
@@ -75,7 +91,8 @@ class Op3(SceneModel):
     that fits the frame and at the gradients of the loss, and replaces the slots' posterior. An interaction
     network predicts the slots of the next frame, where refinement starts again.
 
-    In evaluation mode no graph is built, so whole videos need the memory of one frame (and their masks). Sampling
+    No step of inference needs a graph (`Decoder.pull_back`), so under `no_grad`, where evaluation runs, a whole video
+    needs the memory of one frame and of its `Scene`. Sampling
     stays on in evaluation: nothing but its noise tells slots apart.
 
     Args:
@@ -89,12 +106,15 @@ class Op3(SceneModel):
         first_refinements: of a video's first frame.
         refinements: of every other frame.
         weighting: of the steps' losses, see `Plan`.
-        loss_batch: what the loss is divided by before refinement looks at its gradients. Published: the batch size,
-            which makes a video's result depend on its company; so a fixed number here. It matters only where gradients
-            are as small as the epsilons of the norms.
+        schedule: of the steps in training, see `plan.listed`; `curriculum` reads the scheduled value `predictions`, the
+            number of dynamics steps in a row. Evaluation refines every frame.
+        loss_batch: what the loss is divided by before refinement looks at its gradients. It matters only where they are
+            as small as the epsilons of the norms. None: the batch size, as published, which makes a video's result
+            depend on its company in training; in evaluation a video counts as a batch of its own.
     """
 
     term_names = ("nll", "kl")
+    changeable = ("slots", "first_refinements", "refinements")
 
     def __init__(
         self,
@@ -108,12 +128,16 @@ class Op3(SceneModel):
         first_refinements: Count = 4,
         refinements: Annotated[int, Field(ge=0)] = 2,
         weighting: Weighting = "segment",
-        loss_batch: Count = 4,
+        loss_batch: Count | None = 4,
+        schedule: ScheduleKind = "rprp",
     ) -> None:
         super().__init__()
         self.input_size = (image_size, image_size)
         self.slots, self.sigma, self.beta, self.loss_batch = slots, sigma, beta, loss_batch
-        self.plan = Plan(first_refinements, refinements, weighting)
+        self.batch_statistics = loss_batch is None
+        self.plan = Plan(first_refinements, refinements, weighting, schedule)
+        if schedule == "curriculum":  # no other schedule reads the value, so none of them asks for it
+            self.schedule_ranges = {"predictions": (1.0, 1000.0)}  # type: ignore[misc]
         # N(0, 1 / length), shared by all slots: noise alone tells them apart
         self.start_deterministic = nn.Parameter(torch.randn(deterministic) / deterministic**0.5)
         self.start_mean = nn.Parameter(torch.randn(stochastic) / stochastic**0.5)
@@ -129,18 +153,13 @@ class Op3(SceneModel):
                 f"the model was built for images of {self.input_size} px, the video has {tuple(video.shape[-2:])}: "
                 "resize it or set model.image_size"
             )
-        # no step of inference needs a graph (`Decoder.pull_back`), so only training builds one
-        with torch.set_grad_enabled(self.training and torch.is_grad_enabled()):
-            return self._infer(video, context)
-
-    def _infer(self, video: Tensor, context: Context) -> Scene:
         weights = self.decoder.prepare()
         before = 0 if context.state is None else context.state.frames
         slots = self._start(video, context)
         rendered: Rendered | None = None
-        steps = self.plan.steps(video.shape[1], before)
+        steps = self._steps(video.shape[1], before, context)
         losses: list[tuple[Tensor, Tensor]] = []
-        frames: list[tuple[Slots, Rendered]] = []
+        frames: list[Shown] = []
         for step, following in zip(steps, [*steps[1:], None], strict=True):
             image, noise = video[:, step.frame], context.noise.at(step.frame)
             if step.kind == "dynamics":
@@ -151,9 +170,16 @@ class Op3(SceneModel):
             rendered = self._render(slots, image, weights)
             losses.append((rendered.mixture.nll(), kl(slots.posterior, slots.prior).sum(1)))
             if following is None or following.frame != step.frame:
-                frames.append((slots, rendered))
+                frames.append(_shown(slots, rendered, context.detail))
         state = State(slots.deterministic, slots.sample, before + video.shape[1])
-        return self._scene(frames, self._terms(steps, losses), _by_kind(steps, losses), state, context.detail)
+        return self._scene(frames, steps, losses, state)
+
+    def _steps(self, frames: int, before: int, context: Context) -> list[PlannedStep]:
+        """The steps of this pass."""
+        if not self.training or before > 0:
+            return self.plan.steps(frames, before)
+        predictions = int(context.schedule["predictions"]) if self.plan.schedule == "curriculum" else 1
+        return self.plan.training_steps(frames, predictions)
 
     def _start(self, video: Tensor, context: Context) -> Slots:
         """The slots before the first step."""
@@ -211,12 +237,12 @@ class Op3(SceneModel):
         )
         to_sample = pulled.unflatten(0, slots.sample.shape[:2])[..., -slots.sample.shape[-1] :]
         to_mean, to_raw = parameter_gradients(slots.posterior, slots.prior, slots.eps, to_sample, self.beta)
-        share = 1 / self.loss_batch
+        share = 1 / (self.loss_batch or (len(image) if self.training else 1))
         return ImageGradients(*(x * share for x in found)), to_mean * share, to_raw * share
 
     def _terms(self, steps: list[PlannedStep], losses: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:
         """Weighted means of the steps' losses: the published total is the batch's mean of nll + beta kl."""
-        total = sum(step.weight for step in steps)
+        total = _weight(steps)
         shares = [step.weight / total for step in steps]
         named = zip(self.term_names, zip(*losses, strict=True), strict=True)
         return {
@@ -225,31 +251,40 @@ class Op3(SceneModel):
         }
 
     def _scene(
-        self,
-        frames: list[tuple[Slots, Rendered]],
-        terms: dict[str, Tensor],
-        diagnostics: dict[str, Tensor],
-        state: State,
-        detail: bool,
+        self, frames: list[Shown], steps: list[PlannedStep], losses: list[tuple[Tensor, Tensor]], state: State
     ) -> Scene:
         """The result: every frame as it was after its last step."""
-        masks = torch.stack([rendered.mixture.masks for _, rendered in frames], dim=1)
-        colours = torch.stack([rendered.colours for _, rendered in frames], dim=1)
-        # the mean, not the sample: appearances are compared with one another
-        appearance = [torch.cat([slots.deterministic, slots.posterior.mean], dim=-1) for slots, _ in frames]
-        ids = torch.arange(self.slots, device=masks.device)
+        masks = torch.stack([frame.masks for frame in frames], dim=1)
+        means = [frame.means for frame in frames if frame.means is not None]
         return Scene(
             masks=masks,
             background=torch.zeros(self.slots, dtype=torch.bool, device=masks.device),
-            ids=ids.expand(*masks.shape[:2], -1),
+            ids=torch.arange(self.slots, device=masks.device).expand(*masks.shape[:2], -1),
             presence=masks.new_ones(masks.shape[:3]),
-            appearance=torch.stack(appearance, dim=1),
-            reconstruction=(masks[:, :, :, None] * colours).sum(2).clamp(0, 1),
-            terms=terms,
-            means=colours.clamp(0, 1) if detail else None,
-            diagnostics=diagnostics,
+            appearance=torch.stack([frame.appearance for frame in frames], dim=1),
+            reconstruction=torch.stack([frame.reconstruction for frame in frames], dim=1),
+            terms=self._terms(steps, losses),
+            terms_weight=_weight(steps),
+            means=torch.stack(means, dim=1) if means else None,
+            diagnostics=_by_kind(steps, losses),
             state=state,
         )
+
+
+def _shown(slots: Slots, rendered: Rendered, detail: bool) -> Shown:
+    """What is kept of a frame after its last step."""
+    masks, colours = rendered.mixture.masks, rendered.colours
+    return Shown(
+        masks,
+        (masks[:, :, None] * colours).sum(1).clamp(0, 1),
+        torch.cat([slots.deterministic, slots.posterior.mean], dim=-1),
+        colours.clamp(0, 1) if detail else None,
+    )
+
+
+def _weight(steps: list[PlannedStep]) -> float:
+    """Sum of the steps' weights."""
+    return sum(step.weight for step in steps)
 
 
 def _by_kind(steps: list[PlannedStep], losses: list[tuple[Tensor, Tensor]]) -> dict[str, Tensor]:

@@ -76,6 +76,7 @@ class SlotAttention(SceneModel):
 
     term_names = ("mse",)
     tracks = False
+    changeable = ("slots", "iterations")
 
     def __init__(
         self,
@@ -120,7 +121,7 @@ class SlotAttention(SceneModel):
             masks=masks,
             background=torch.zeros(self.slots, dtype=torch.bool, device=video.device),
             ids=torch.arange(self.slots, device=video.device).expand(b, t, -1),
-            presence=torch.ones(b, t, self.slots, device=video.device),
+            presence=masks.new_ones(b, t, self.slots),
             appearance=slots.unflatten(0, (b, t)),
             reconstruction=_as_rgb(mixed).unflatten(0, (b, t)),
             terms={"mse": error.unflatten(0, (b, t)).sum(dim=1)},

@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.models.space.networks import conv_elu, cpu_layout
+from apex_lab.models.space.networks import conv_elu, cpu_layout, running, update_running
 from apex_lab.nn.precision import full
 
 
@@ -58,25 +58,8 @@ class BroadcastDecoder(nn.Module):
             if norm.training:
                 mean = by_latent.mean(0) + by_place.mean((0, 2, 3))
                 variance = by_latent.var(0, unbiased=False) + by_place.var((0, 2, 3), unbiased=False)
-                _update(norm, mean, variance, len(latent) * by_place[0, 0].numel())
+                update_running(norm, mean, variance, len(latent) * by_place[0, 0].numel())
             else:
-                mean, variance = _running(norm)
+                mean, variance = running(norm)
             gain = norm.weight * torch.rsqrt(variance + norm.eps)
             return by_latent * gain + (norm.bias - mean * gain), by_place * gain[:, None, None]
-
-
-def _running(norm: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
-    assert norm.running_mean is not None
-    assert norm.running_var is not None
-    return norm.running_mean, norm.running_var
-
-
-@torch.no_grad()
-def _update(norm: nn.BatchNorm2d, mean: Tensor, variance: Tensor, count: int) -> None:
-    """What BatchNorm does to its running statistics in training; `variance` is the biased one of `count` values."""
-    running_mean, running_var = _running(norm)
-    assert norm.momentum is not None
-    assert norm.num_batches_tracked is not None
-    running_mean.lerp_(mean, norm.momentum)
-    running_var.lerp_(variance * (count / (count - 1)), norm.momentum)
-    norm.num_batches_tracked.add_(1)

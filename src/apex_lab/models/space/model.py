@@ -49,6 +49,7 @@ class Space(SceneModel):
         "fixed_alpha": (0.0, 1.0),
     }
     tracks = False
+    evaluates_at_end = True  # as the published evaluation (space.md section 8)
     batch_statistics = True  # BatchNorm in the background
 
     def __init__(

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -30,7 +31,59 @@ def conv_celu(inputs: int, outputs: int, kernel: int, stride: int, padding: int,
 def conv_elu(inputs: int, outputs: int, stride: int, padding: int) -> nn.Sequential:
     """3 x 3 convolution, BatchNorm, ELU."""
     conv = nn.Conv2d(inputs, outputs, 3, stride, padding)
-    return nn.Sequential(conv, nn.BatchNorm2d(outputs), nn.ELU(inplace=True))
+    return nn.Sequential(conv, BatchNorm(outputs), nn.ELU(inplace=True))
+
+
+class BatchNorm(nn.BatchNorm2d):
+    """BatchNorm whose statistics are exact on a CPU too.
+
+    For channels-last images PyTorch (2.12) sums a channel's values one by one in single precision, in training. At 128
+    pixels with K = 5 that moved the likelihood by 6e-5 of its value; with statistics from a reduction it is 2e-7.
+    """
+
+    def forward(self, x: Float[Tensor, "m C h w"]) -> Float[Tensor, "m C h w"]:
+        if not self.training or x.device.type != "cpu" or x.dtype == torch.bfloat16:
+            return super().forward(x)
+        found, mean, variance = _Normalised.apply(x, self.weight, self.bias, self.eps)
+        update_running(self, mean, variance, x.numel() // x.shape[1])
+        return found
+
+
+class _Normalised(torch.autograd.Function):
+    """x, weight, bias, eps -> normalised x, and the channels' mean and biased variance (no gradient goes through)."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, eps: float) -> tuple[Tensor, Tensor, Tensor]:  # type: ignore[override]
+        mean = x.mean((0, 2, 3))
+        variance = (x - mean[:, None, None]).square_().mean((0, 2, 3))  # torch.var takes three times as long
+        ctx.save_for_backward(x, weight, mean, torch.rsqrt(variance + eps))
+        ctx.eps = eps
+        ctx.mark_non_differentiable(mean, variance)
+        return F.batch_norm(x, mean, variance, weight, bias, eps=eps), mean, variance
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        x, weight, mean, inverse = ctx.saved_tensors
+        inputs = (gradient, x, weight, None, None, mean, inverse, True, ctx.eps, [True] * 3)
+        return *torch.ops.aten.native_batch_norm_backward(*inputs), None
+
+
+def running(norm: nn.BatchNorm2d) -> tuple[Tensor, Tensor]:
+    """Running mean and variance."""
+    assert norm.running_mean is not None
+    assert norm.running_var is not None
+    return norm.running_mean, norm.running_var
+
+
+@torch.no_grad()
+def update_running(norm: nn.BatchNorm2d, mean: Tensor, variance: Tensor, count: int) -> None:
+    """What BatchNorm does to its running statistics in training; `variance` is the biased one of `count` values."""
+    running_mean, running_var = running(norm)
+    assert norm.momentum is not None
+    assert norm.num_batches_tracked is not None
+    running_mean.lerp_(mean, norm.momentum)
+    running_var.lerp_(variance * (count / (count - 1)), norm.momentum)
+    norm.num_batches_tracked.add_(1)
 
 
 def cpu_layout(x: Tensor) -> Tensor:
@@ -67,7 +120,7 @@ class ImageEncoder(nn.Module):
 
     def __init__(self, image_size: int, grid: int) -> None:
         super().__init__()
-        halvings = math.log2(image_size / grid)
+        halvings = math.log2(image_size / grid) if image_size > 0 and grid > 0 else None
         if halvings not in (3, 4, 5):
             raise ValueError(
                 f"model.grid={grid} must be an 8th, 16th or 32nd of model.image_size={image_size}: "

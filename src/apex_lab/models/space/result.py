@@ -11,6 +11,9 @@ from apex_lab.models.space.foreground import Drawn
 from apex_lab.models.space.latents import Cells
 from apex_lab.scene import BACKGROUND_ID, Scene
 
+LIVE = 0.5
+"""A cell holds an object where q(pres) is above it (section 10)."""
+
 
 class Found(NamedTuple):
     """What was inferred of n images; backdrop and reconstruction (n, 3, H, W), RGB in [0, 1]."""
@@ -45,7 +48,9 @@ def scene_of(found: Found, terms: dict[str, Tensor], batch: int, detail: bool) -
         return video_of(torch.cat([values, torch.full_like(values[:, :1], fill)], dim=1))
 
     probability = cells.presence_prob.detach()
-    live = probability > 0.5
+    live = probability > LIVE
+    # a cell at the limit is absent (section 10), and a presence of 0.5 would count as present
+    probability = torch.where(probability == LIVE, torch.nextafter(probability, probability.new_zeros(())), probability)
     size = cells.windows[..., :2].detach().mean(-1)
     means = None
     if detail:
