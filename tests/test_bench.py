@@ -299,6 +299,17 @@ def refuse_in_child(_: object) -> None:
     raise UserError("No.")
 
 
+@pytest.mark.parametrize("model", ["gswm", "op3", "scalor", "slot_attention", "space"])
+def test_every_twin_takes_the_recipe_s_optimiser(model: str) -> None:
+    """Also where the recipe has several, each for parameters with names of its own."""
+    job = compose_job(f"model={model}", "scale=paper")
+    config = check_job(job.raw, job.choices).config
+    work = compare.workload(compare.Comparison(config, "cpu", 1, 1, 0, 1), "straightforward")
+    assert work.optimizer is not None
+    found = [weight for group in work.optimizer.param_groups for weight in group["params"]]
+    assert {id(weight) for weight in found} == {id(weight) for weight in work.model.parameters()}
+
+
 @pytest.mark.slow
 def test_a_child_that_dies_is_told() -> None:
     with pytest.raises(UserError, match=r"ended by SIGKILL, as happens when memory runs out: lower clips\.batch_size"):

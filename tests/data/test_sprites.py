@@ -42,7 +42,7 @@ def test_labels_are_where_colours_are() -> None:
     for index in range(20):
         item = videos[index]
         image, labels = item["video"].permute(0, 2, 3, 1).numpy().astype(int), item["segmentation"].numpy()
-        sprites = draw_sprites(0, "train", index, (1, 4))
+        sprites = draw_sprites(0, "train", index, (2, 4))
         assert set(np.unique(labels)) <= set(range(len(sprites) + 1))
         for number, sprite in enumerate(sprites, start=1):
             inside = image[labels == number]
@@ -66,7 +66,7 @@ def test_occlusion_is_what_nearer_sprites_cover() -> None:
     videos = source(train=30).sets["train"]
     for index in range(30):
         about, labels = videos.metadata(index), videos[index]["segmentation"].numpy()
-        sprites = draw_sprites(0, "train", index, (1, 4))
+        sprites = draw_sprites(0, "train", index, (2, 4))
         assert about.occlusion is not None
         for column, sprite in enumerate(sprites):
             alone = (coverage(sprite, 0, 64) >= 0.5).sum()

@@ -35,9 +35,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     batches: list[int] = []
     plain = Predictor.__call__
 
-    def counted(self: Predictor, batch: dict[str, Any], detail: bool = False) -> Any:
+    def counted(self: Predictor, batch: dict[str, Any], **options: Any) -> Any:
         batches.append(len(batch["index"]))
-        return plain(self, batch, detail)
+        return plain(self, batch, **options)
 
     monkeypatch.setattr(Predictor, "__call__", counted)
     return batches
@@ -159,10 +159,10 @@ def test_killed_in_the_middle_it_resumes(
     asked.clear()
     plain = Predictor.__call__
 
-    def killed(self: Predictor, batch: dict[str, Any], detail: bool = False) -> Any:
+    def killed(self: Predictor, batch: dict[str, Any], **options: Any) -> Any:
         if len(asked) == 1:
             raise Interrupted(15)
-        return plain(self, batch, detail)
+        return plain(self, batch, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr(Predictor, "__call__", killed)
@@ -187,10 +187,10 @@ def test_what_was_begun_otherwise_is_not_mixed_in(
     plain = Predictor.__call__
     with monkeypatch.context() as patch:
 
-        def killed(self: Predictor, batch: dict[str, Any], detail: bool = False) -> Any:
+        def killed(self: Predictor, batch: dict[str, Any], **options: Any) -> Any:
             if len(asked) == 2:
                 raise Interrupted(15)
-            return plain(self, batch, detail)
+            return plain(self, batch, **options)
 
         patch.setattr(Predictor, "__call__", killed)
         assert ask(f"checkpoint={run}", *words).code == 128 + 15

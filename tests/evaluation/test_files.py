@@ -108,10 +108,10 @@ def test_an_exception_among_several_stops_none(make_run: Make, ask: Ask, monkeyp
     runs = [make_run(seed=seed) for seed in (0, 1)]
     plain = Predictor.__call__
 
-    def sick(self: Predictor, batch: dict[str, Any], detail: bool = False) -> Any:
+    def sick(self: Predictor, batch: dict[str, Any], **options: Any) -> Any:
         if self.seed == 0:
             raise RuntimeError("sizes do not fit")
-        return plain(self, batch, detail)
+        return plain(self, batch, **options)
 
     monkeypatch.setattr(Predictor, "__call__", sick)
     ended = ask("checkpoint=outputs", "pictures=0")
@@ -224,11 +224,11 @@ def test_what_is_left_of_another_evaluation_is_removed(
     calls = []
     plain = Predictor.__call__
 
-    def killed(self: Predictor, batch: dict[str, Any], detail: bool = False) -> Any:
+    def killed(self: Predictor, batch: dict[str, Any], **options: Any) -> Any:
         calls.append(1)
         if len(calls) == 2:
             raise Interrupted(15)
-        return plain(self, batch, detail)
+        return plain(self, batch, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr(Predictor, "__call__", killed)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,16 +18,27 @@ class Twin(SceneModel):
         model: whose terms, schedules and input size it has.
         weights: what is trained: the twin itself, or the model where the twin reads its weights.
         terms: (video, context) -> loss terms, each (B,).
+        group: a parameter's name in the twin -> the beginning that its name has in the model, where the recipe has
+            an optimiser for each such group.
     """
 
     def __init__(
-        self, model: SceneModel, weights: nn.Module, terms: Callable[[Tensor, Context], dict[str, Tensor]]
+        self,
+        model: SceneModel,
+        weights: nn.Module,
+        terms: Callable[[Tensor, Context], dict[str, Tensor]],
+        group: Callable[[str], str] = lambda name: "",
     ) -> None:
         super().__init__()
         self.weights = weights
         self.input_size = model.input_size
-        self._terms = terms
+        self._terms, self._group = terms, group
 
     def forward(self, video: Tensor, context: Context) -> Any:
         """Not a `Scene`: its terms alone."""
         return SimpleNamespace(terms=self._terms(video, context), diagnostics={})
+
+    def named_parameters(self, *args: Any, **options: Any) -> Iterator[tuple[str, nn.Parameter]]:
+        """As of every module, with the beginnings by which the recipe tells its optimisers' parameters."""
+        for name, weight in super().named_parameters(*args, **options):
+            yield self._group(name.removeprefix("weights.")) + name, weight

@@ -61,6 +61,10 @@ def log_normal(x: Tensor, mean: Tensor, std: float) -> Tensor:
     return torch.distributions.Normal(mean, std).log_prob(x)
 
 
+FOREGROUND = ("trunk", "lateral", "merge", "heads", "what_encoder", "what_decoder", "rgb", "mask.")
+"""Beginnings of the names of what `NaiveSpace._build_foreground` makes."""
+
+
 class NaiveSpace(nn.Module):
     """Takes the weights of a `Space`, by the order in which both define their layers."""
 
@@ -317,4 +321,9 @@ def twins(model: Space, node: Mapping[str, Any]) -> dict[str, Twin]:
     names = ("sigma_fg", "sigma_bg", "scale_std", "decoder_width")
     sizes = {name: node[name] for name in names if name in node}
     naive = NaiveSpace(model, model.image_size, node["grid"], node["components"], **sizes)
-    return {"straightforward": Twin(model, naive, lambda video, context: naive(video, context).terms)}
+    return {"straightforward": Twin(model, naive, lambda video, context: naive(video, context).terms, _group)}
+
+
+def _group(name: str) -> str:
+    """The optimiser's group of a parameter of the twin."""
+    return "foreground." if name.startswith(FOREGROUND) else "background."

@@ -57,7 +57,8 @@ def look(
             content = _glance(file, trusted, _stamp(file))
             stored = here(file, content["config"], paths, trusted)
             _checked(file, stored)
-            changed(stored["model"], model or {})
+            if model:
+                changed(stored["model"], model)
             node = data.instead_of(stored["data"]) if data else stored["data"]
             if data:
                 components.check(node, "data")
