@@ -33,6 +33,8 @@ class Result:
 
 def cut(image: Tensor, where: Tensor, height: int, width: int) -> Tensor:
     """Crops (N, C, height, width) of images (N, C, H, W) at z_where = (s_x, s_y, t_x, t_y)."""
+    if not len(where):  # no object anywhere, which `affine_grid` refuses
+        return image.new_zeros(0, image.shape[1], height, width)
     s_x, s_y, t_x, t_y = where.unbind(-1)
     zero = torch.zeros_like(s_x)
     theta = torch.stack([torch.stack([s_x, zero, t_x], -1), torch.stack([zero, s_y, t_y], -1)], 1)
@@ -42,6 +44,8 @@ def cut(image: Tensor, where: Tensor, height: int, width: int) -> Tensor:
 
 def put(glimpse: Tensor, where: Tensor, height: int, width: int) -> Tensor:
     """The inverse: glimpses pasted into empty images."""
+    if not len(where):
+        return glimpse.new_zeros(0, glimpse.shape[1], height, width)
     s_x, s_y, t_x, t_y = where.unbind(-1)
     a, b, zero = 1 / (s_x + 1e-9), 1 / (s_y + 1e-9), torch.zeros_like(s_x)
     theta = torch.stack([torch.stack([a, zero, -t_x * a], -1), torch.stack([zero, b, -t_y * b], -1)], 1)
