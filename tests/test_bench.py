@@ -273,6 +273,19 @@ def test_refuses_in_one_sentence(word: str, command: Callable[..., Ended], tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_follows_its_schedule_is_not_measured_as_a_graph() -> None:
+    words = ("model=op3", "data=sprites", "scale=smoke", "model.schedule=curriculum", "+schedule.predictions=1.0")
+    job = compose_job(*words)
+    job = check_job(job.raw, job.choices)
+    keys = {"modes": None, "warmup": 1, "repeats": 1, "memory": False, "compare": False, "output": None}
+    keys |= {"cpu_videos": None, "cpu_frames": None, "cpu_compiled_frames": None}
+    raw = {**job.raw, "bench": keys}
+    assert bench.check_bench(raw, job.choices, ()).modes == ("eager", "compiled")
+    raw["bench"] = {**keys, "modes": ["cuda graph"]}
+    with pytest.raises(UserError, match=r"bench\.modes holds 'cuda graph', and this model's steps follow its schedule"):
+        bench.check_bench(raw, job.choices, ())
+
+
 def test_composes_what_train_composes(command: Callable[..., Ended]) -> None:
     words = ("scale=cpu", "+ablation=image_stn", "seed=3", "--cfg", "job", "--resolve")
     train, measured = (command(entry, *words).out for entry in ("train", "bench"))

@@ -98,7 +98,8 @@ def check_bench(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequ
     asked = validate(BenchPart, keys, "bench")
     assert isinstance(asked, BenchPart)
     job = check_job({key: value for key, value in raw.items() if key != "bench"}, choices, overrides)
-    if build_model(job.config).needs_labels:
+    model = build_model(job.config)
+    if model.needs_labels:
         raise UserError(f"model={choices.get('model')} reads the ground truth: choose a model that looks at the video.")
     for name in ("image_size", "frames"):
         if not isinstance(job.config.data.get(name), int):
@@ -106,6 +107,10 @@ def check_bench(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequ
     if asked.output is not None and Path(asked.output).is_dir():
         raise UserError(f"bench.output = {shown(asked.output)} is a folder: name a file.")
     modes = _modes(asked, job)
+    if not model.capturable:
+        if asked.modes is not None and "cuda graph" in modes:
+            raise UserError("bench.modes holds 'cuda graph', and this model's steps follow its schedule: leave it out.")
+        modes = tuple(mode for mode in modes if mode != "cuda graph")
     if "cuda graph" in modes and asked.modes is not None and device_of(job.config.trainer.accelerator).type == "cpu":
         raise UserError("bench.modes holds 'cuda graph', but nothing is measured on a GPU: leave it out.")
     return Bench(job, asked, modes)

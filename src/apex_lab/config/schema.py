@@ -376,6 +376,11 @@ def _check_objective(config: Config) -> None:
         if not model.needs_training:
             raise UserError("init_from is for training, and this model has nothing to train: leave it out.")
         initial.refuse_misfit(config.init_from, {n: tuple(v.shape) for n, v in model.state_dict().items()})
+    if config.trainer.cuda_graph and not model.capturable:
+        raise UserError(
+            "trainer.cuda_graph = true repeats one step, and what this model does in a step follows its schedule: set "
+            "trainer.cuda_graph=false."
+        )
     schedules, weights = build_schedules(config), build_weights(config)
     source = components.build(config.data, "data")
     if not isinstance(source, VideoSource):

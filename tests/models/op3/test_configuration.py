@@ -8,6 +8,7 @@ import pytest
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from apex_lab.base.errors import UserError
 from apex_lab.config.schema import build_model
 from apex_lab.models.op3 import Op3
 from tests.conftest import compose_job
@@ -70,3 +71,11 @@ def test_the_original_experiments(name: str, slots: int, schedule: str, frames: 
         assert (node["delay"], node["every"]) == (100 * epoch, 10 * epoch)
     else:  # T = 5 steps
         assert len(model.plan.training_steps(frames)) == 5
+
+
+def test_a_curriculum_cannot_be_captured() -> None:
+    words = ("model=op3", "scale=paper", "data=sprites", "trainer.cuda_graph=true")
+    with pytest.raises(UserError, match="cuda_graph = true repeats one step, .* set trainer.cuda_graph=false"):
+        compose_job(*words, "+experiment=op3_curriculum_original")
+    with pytest.raises(UserError, match="needs one CUDA device"):  # the other schedules are the same at every step
+        compose_job(*words, "trainer=cpu", "+experiment=op3_original")

@@ -136,6 +136,7 @@ class Op3(SceneModel):
         self.slots, self.sigma, self.beta, self.loss_batch = slots, sigma, beta, loss_batch
         self.batch_statistics = loss_batch is None
         self.plan = Plan(first_refinements, refinements, weighting, schedule)
+        self.capturable = schedule != "curriculum"
         if schedule == "curriculum":  # no other schedule reads the value, so none of them asks for it
             self.schedule_ranges = {"predictions": (1.0, 1000.0)}  # type: ignore[misc]
         # N(0, 1 / length), shared by all slots: noise alone tells them apart
