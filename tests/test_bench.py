@@ -250,6 +250,22 @@ def test_any_model_can_be_measured(
     assert all(each["comparisons"] == [] for each in told)
 
 
+def stop(*_: object) -> None:
+    os.kill(os.getpid(), signal.SIGTERM)
+    time.sleep(10)  # the handler raises
+
+
+def test_stopped_it_does_not_say_that_it_resumes(
+    command: Callable[..., Ended], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "in_child", stop)
+    for words in ((), ("seed=0,1", "-m")):
+        ended = command("bench", *TINY, "trainer=cpu", *words)
+        assert ended.code == 128 + signal.SIGTERM
+        assert "Stopped by SIGTERM; the same command begins from the start." in ended.err
+        assert "resumes" not in ended.out + ended.err
+
+
 REFUSED = {
     "bench.repeats=0": "bench.repeats = 0 is wrong: input should be greater than or equal to 1.",
     "+bench.repeat=3": "Unknown key bench.repeat = 3; did you mean 'repeats'?",
@@ -274,7 +290,7 @@ def test_refuses_in_one_sentence(word: str, command: Callable[..., Ended], tmp_p
 
 
 def test_what_follows_its_schedule_is_not_measured_as_a_graph() -> None:
-    words = ("model=op3", "data=sprites", "scale=smoke", "model.schedule=curriculum", "+schedule.predictions=1.0")
+    words = ("model=op3", "data=sprites", "scale=smoke", "model.schedule=curriculum", "+schedule.predictions={_target_: apex_lab.training.schedules.Constant, value: 1.0}")
     job = compose_job(*words)
     job = check_job(job.raw, job.choices)
     keys = {"modes": None, "warmup": 1, "repeats": 1, "memory": False, "compare": False, "output": None}

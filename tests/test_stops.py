@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import signal
@@ -10,12 +11,14 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import lightning as L
 import pytest
 import torch
 
+from apex_lab.config import command_line
 from apex_lab.runs import checkpoints
 from tests import tiny
 from tests.conftest import TINY, Ended, compose_job, train_in, wait_for_step
@@ -76,6 +79,35 @@ def at(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 def ask(number: int) -> Callable[[], None]:
     return lambda: os.kill(os.getpid(), number)
+
+
+def job(again: bool = False, **more: object) -> SimpleNamespace:
+    return SimpleNamespace(asked=SimpleNamespace(again=again), **more)
+
+
+@pytest.mark.parametrize(
+    ("entry", "asked", "resumes"),
+    [
+        ("train", job(), True),
+        ("bench", job(), False),
+        ("compare", job(), False),
+        ("arrange", job(), True),
+        ("arrange", job(again=True), False),
+        ("evaluate", job(predictions=None), True),
+        ("evaluate", job(predictions=None, again=True), False),
+        ("evaluate", job(predictions="other.npz"), False),
+        ("predict", job(videos=("clip.mp4",)), True),
+        ("predict", job(videos=("clip.mp4",), again=True), False),
+        ("predict", job(videos=(0,)), False),  # a camera shows something else then
+    ],
+)
+def test_a_command_says_that_it_resumes_where_it_does(
+    entry: str, asked: SimpleNamespace, resumes: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    launched: list[command_line.Command] = []
+    monkeypatch.setattr(command_line, "launch", launched.append)
+    importlib.import_module(f"apex_lab.{entry}").main()
+    assert launched[0].resumes(asked) is resumes
 
 
 def stopped(run: Path, step: int, name: str) -> None:

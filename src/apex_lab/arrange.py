@@ -73,7 +73,7 @@ class Arrangement:
 
 def main() -> None:
     """Entry point: `python -m apex_lab.arrange`."""
-    cli.launch(cli.Command("arrange", check_arrangement, arrange, title))
+    cli.launch(cli.Command("arrange", check_arrangement, arrange, title, resumes=lambda job: not job.asked.again))
 
 
 def title(job: Arrangement) -> str:

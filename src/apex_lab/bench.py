@@ -78,7 +78,7 @@ class Bench:
 
 def main() -> None:
     """Entry point: `python -m apex_lab.bench`."""
-    cli.launch(cli.Command("bench", check_bench, bench, title))
+    cli.launch(cli.Command("bench", check_bench, bench, title, resumes=lambda asked: False))
 
 
 def title(asked: Bench) -> str:

@@ -79,6 +79,7 @@ def main() -> None:
             literal=("video", "folder"),
             of_checkpoint=("data.",),
             model_groups=False,
+            resumes=lambda job: False,  # it writes when all is drawn
         )
     )
 

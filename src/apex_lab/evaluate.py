@@ -84,7 +84,16 @@ class Evaluation:
 
 def main() -> None:
     """Entry point: `python -m apex_lab.evaluate`."""
-    cli.launch(cli.Command("evaluate", check_evaluation, evaluate, title, of_checkpoint=("data.", "model.")))
+    cli.launch(
+        cli.Command(
+            "evaluate",
+            check_evaluation,
+            evaluate,
+            title,
+            of_checkpoint=("data.", "model."),
+            resumes=lambda job: job.predictions is None and not job.asked.again,
+        )
+    )
 
 
 def title(job: Evaluation) -> str:

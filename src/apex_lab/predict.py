@@ -80,6 +80,7 @@ def main() -> None:
             literal=("checkpoint", "video", "folder"),
             of_checkpoint=("model.",),
             model_groups=False,
+            resumes=lambda job: not job.asked.again and not any(isinstance(video, int) for video in job.videos),
         )
     )
 

@@ -174,8 +174,7 @@ class SceneModel(nn.Module):
     """True for models that normalise over the batch in training, or draw for it: a result depends on other videos."""
 
     capturable: bool = True
-    """False for models whose operations follow scheduled values: a step is not the same at every step of training, so it
-    cannot be captured as a CUDA graph."""
+    """False for models whose operations follow scheduled values: no CUDA graph holds all their steps of training."""
 
     input_size: tuple[int, int] | None = None
     """(H, W) in pixels for a model built for one size: videos are resized to it, masks back. None: any size."""

@@ -66,6 +66,7 @@ class Command:
         of_checkpoint: beginnings of words such as `data.` that are passed on though no file has such keys, since a
             checkpoint brings these settings; the check knows which exist.
         model_groups: the command composes models, so short names of their groups (`masks=scalor`) are understood.
+        resumes: whether the same command goes on with a job that was stopped, so that this may be said.
     """
 
     config_name: str
@@ -77,6 +78,7 @@ class Command:
     literal: tuple[str, ...] = ()
     of_checkpoint: tuple[str, ...] = ()
     model_groups: bool = True
+    resumes: Callable[[Any], bool] = lambda job: True
 
 
 def launch(command: Command) -> None:
@@ -88,6 +90,7 @@ def launch(command: Command) -> None:
     console.setup()
     attached.listen()
     ended: list[tuple[str, str | None]] = []  # of the job that is no sweep's
+    begun: list[Any] = []
 
     def do(config: DictConfig) -> str:
         """Checks and does a job in this process; how it ended."""
@@ -95,6 +98,7 @@ def launch(command: Command) -> None:
         overrides = list(HydraConfig.get().overrides.task)
         try:
             job = command.check(plain(config), chosen(HydraConfig.get().runtime), overrides)
+            begun.append(job)
             state = command.work(job) or "finished"
         except Busy as error:
             return end("busy", JobBusy(str(error)), str(error))
@@ -130,9 +134,11 @@ def launch(command: Command) -> None:
         attached.tell("failed", one_line(error))
         sys.exit(CONFIG_ERROR)
     except Interrupted as stop:
+        resumes = all(command.resumes(job) for job in (*begun, *(item.job for item in sweep.items)))
         sweep.take_stock()
-        sweep.report()
-        console.error(f"Stopped by {stop}; the same command resumes from here.")
+        sweep.report(resumes)
+        again = "resumes from here" if resumes else "begins from the start"
+        console.error(f"Stopped by {stop}; the same command {again}.")
         attached.tell("interrupted", str(stop))
         sys.exit(128 + stop.signum)
     sweep.report()

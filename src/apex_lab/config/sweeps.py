@@ -120,12 +120,16 @@ class Sweep:
             if state == "failed"
         ]
 
-    def report(self) -> None:
-        """Says what became of the jobs; failures go to standard error."""
+    def report(self, resumes: bool = True) -> None:
+        """Says what became of the jobs; failures go to standard error.
+
+        Args:
+            resumes: whether the same command goes on with what was stopped.
+        """
         counts = Counter(state for state, _ in self.outcomes.values())
         if len(self.items) > 1 and set(counts) != {"failed"}:
             console.say(f"{len(self.items)} jobs: {_counted(counts)}.")
-        if counts["paused"] or counts["interrupted"]:
+        if resumes and (counts["paused"] or counts["interrupted"]):
             console.say("The same command resumes what has not finished.")
         if self.failures:
             console.error(f"{len(self.failures)} of {len(self.items)} failed:")

@@ -75,7 +75,7 @@ def test_the_original_experiments(name: str, slots: int, schedule: str, frames: 
 
 def test_a_curriculum_cannot_be_captured() -> None:
     words = ("model=op3", "scale=paper", "data=sprites", "trainer.cuda_graph=true")
-    with pytest.raises(UserError, match="cuda_graph = true repeats one step, .* set trainer.cuda_graph=false"):
+    with pytest.raises(UserError, match=r"cuda_graph = true repeats one step, .* set trainer\.cuda_graph=false"):
         compose_job(*words, "+experiment=op3_curriculum_original")
     with pytest.raises(UserError, match="needs one CUDA device"):  # the other schedules are the same at every step
         compose_job(*words, "trainer=cpu", "+experiment=op3_original")
