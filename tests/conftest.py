@@ -27,7 +27,7 @@ from tests.interrupts import hear_ctrl_c
 install_import_hook("apex_lab", f"{tests.typechecked.__name__}.checked")
 
 from apex_lab.config.composition import conf_dir, plain  # noqa: E402
-from apex_lab.config.schema import Job, check_job  # noqa: E402
+from apex_lab.config.job import Job, check_job  # noqa: E402
 
 hear_ctrl_c()
 

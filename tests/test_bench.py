@@ -26,7 +26,7 @@ from apex_lab.benchmark import printed as report
 from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.profile import REST, seconds_by_part
 from apex_lab.benchmark.work import Workload
-from apex_lab.config.schema import check_job
+from apex_lab.config.job import check_job
 from apex_lab.training.optimizers import Muon
 from tests.conftest import TINY, Ended, compose_job
 
@@ -147,7 +147,7 @@ ONE_GRAPH = """
 import json, sys
 import torch
 from apex_lab.benchmark.work import Workload
-from apex_lab.config.schema import check_job
+from apex_lab.config.job import check_job
 from apex_lab.nn.noise import RankNoise
 from apex_lab.scene import Context
 work = Workload(check_job(json.load(sys.stdin), {}, needs_recipe=False).config, torch.device("cpu"), 1, 2)
@@ -290,8 +290,8 @@ def test_refuses_in_one_sentence(word: str, command: Callable[..., Ended], tmp_p
 
 
 def test_what_follows_its_schedule_is_not_measured_as_a_graph() -> None:
-    words = ("model=op3", "data=sprites", "scale=smoke", "model.schedule=curriculum", "+schedule.predictions={_target_: apex_lab.training.schedules.Constant, value: 1.0}")
-    job = compose_job(*words)
+    predictions = "+schedule.predictions={_target_: apex_lab.training.schedules.Constant, value: 1.0}"
+    job = compose_job("model=op3", "data=sprites", "scale=smoke", "model.schedule=curriculum", predictions)
     job = check_job(job.raw, job.choices)
     keys = {"modes": None, "warmup": 1, "repeats": 1, "memory": False, "compare": False, "output": None}
     keys |= {"cpu_videos": None, "cpu_frames": None, "cpu_compiled_frames": None}

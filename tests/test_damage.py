@@ -140,7 +140,7 @@ def test_a_run_of_format_1_is_found_without_its_record(tmp_path: Path, monkeypat
 
     import yaml
 
-    from apex_lab.config.schema import check_job
+    from apex_lab.config.job import check_job
     from apex_lab.config.upgrades import upgraded
     from apex_lab.runs.folder import run_folder
     from tests.conftest import REPOSITORY

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from apex_lab.config.schema import build_model, check_job
+from apex_lab.config.building import build_model
+from apex_lab.config.job import check_job
 from apex_lab.runs import checkpoints
 from apex_lab.scene import Context, schedule_at
 from tests.conftest import REPOSITORY

@@ -25,7 +25,10 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.validation import PathText, one_line, sentence, shown, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import components
-from apex_lab.config import schema as config
+from apex_lab.config.building import build_model
+from apex_lab.config.building import device as device_of
+from apex_lab.config.job import explain_merged, refuse_missing
+from apex_lab.config.schema import PathsPart
 from apex_lab.evaluation.checkpoint import load, run_folder
 from apex_lab.evaluation.files import Bad, find, listed, look
 from sims.arrangement import scenario
@@ -56,7 +59,7 @@ class ArrangeConfig(BaseModel):
     folder: PathText | None
     again: bool
     trust: bool
-    paths: config.PathsPart
+    paths: PathsPart
 
 
 @dataclass(frozen=True)
@@ -90,15 +93,15 @@ def check_arrangement(raw: dict[str, Any], choices: Mapping[str, str], overrides
     raw = {key: value for key, value in raw.items() if key != "hydra"}
     asked = validate(ArrangeConfig, raw, "")
     assert isinstance(asked, ArrangeConfig)
-    config.refuse_missing(raw)
-    config.device(asked.accelerator)
+    refuse_missing(raw)
+    device_of(asked.accelerator)
     world = _world(asked)
     if "_target_" not in asked.perception:
         raise UserError("perception has no _target_: choose perception=trained, oracle or color_clusters.")
     try:
         components.check(asked.perception, "perception")
     except UserError as error:
-        config.explain_merged(str(error), overrides)
+        explain_merged(str(error), overrides)
         raise
     perception = components.build(asked.perception, "perception")
     if not isinstance(perception, Perception):
@@ -208,7 +211,7 @@ def _of_file(job: Arrangement, file: Path) -> Benchmark:
     run = run_folder(file)
     in_run = (run / "run.json").is_file()
     early = (content["training"] or {}).get("ended", False)
-    learns = config.build_model(trained.config).needs_training
+    learns = build_model(trained.config).needs_training
     ended = early or content["step"] >= trained.config.trainer.max_steps or not learns
     usual = (tuple(sorted(asked.tasks)), asked.scenarios, asked.seed) == (TASKS, SCENARIOS, SEED)
     usual &= job.world == Settings()
@@ -229,7 +232,7 @@ def _benchmark(job: Arrangement, file: Path | None, name: str, base: Path, into:
         checkpoint=None if file is None else file.absolute(),
         digest=None if file is None else digest_of(file),
         trusted=asked.trust,
-        device=str(config.device(asked.accelerator)),
+        device=str(device_of(asked.accelerator)),
         world=job.world,
         seed=asked.seed,
     )

@@ -27,8 +27,10 @@ from apex_lab.benchmark.compare import Comparison, compare, twins_of
 from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.work import clip_length
 from apex_lab.config import command_line as cli
-from apex_lab.config.schema import Config, Job, build_model, check_job
-from apex_lab.config.schema import device as device_of
+from apex_lab.config.building import build_model
+from apex_lab.config.building import device as device_of
+from apex_lab.config.job import Job, check_job
+from apex_lab.config.schema import Config
 from apex_lab.runs import provenance
 from apex_lab.runs.folder import group_name
 from apex_lab.training.update import Mode

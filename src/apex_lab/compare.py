@@ -20,7 +20,9 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.validation import PathText, shown, validate
 from apex_lab.config import command_line as cli
 from apex_lab.config import components
-from apex_lab.config import schema as config
+from apex_lab.config.building import device as device_of
+from apex_lab.config.job import refuse_missing
+from apex_lab.config.schema import PathsPart
 from apex_lab.data import VideoSource
 from apex_lab.evaluation.checkpoint import load
 from apex_lab.evaluation.files import find, look
@@ -53,7 +55,7 @@ class CompareConfig(BaseModel):
     folder: PathText | None
     accelerator: Literal["auto", "cpu", "gpu"]
     trust: bool
-    paths: config.PathsPart
+    paths: PathsPart
     seed: int = Field(default=0, ge=0)
     data: dict[str, Any] = Field(default_factory=dict)
 
@@ -97,11 +99,11 @@ def check_comparison(raw: dict[str, Any], choices: Mapping[str, str], overrides:
     """
     asked = validate(CompareConfig, {key: value for key, value in raw.items() if key != "hydra"}, "")
     assert isinstance(asked, CompareConfig)
-    config.refuse_missing(raw)
+    refuse_missing(raw)
     patterns = [asked.checkpoints] if isinstance(asked.checkpoints, str) else asked.checkpoints
     if not patterns:
         raise UserError("checkpoints is missing: write 'checkpoints=[a.ckpt, outputs/<run>/seed_0]'.")
-    config.device(asked.accelerator)
+    device_of(asked.accelerator)
     given = [word.lstrip("+").partition("=")[0] for word in overrides if word.lstrip("+").startswith("data.")]
     data = OtherData(asked.data, tuple(key.removeprefix("data.") for key in given))
     files, bad = find(patterns)
@@ -130,7 +132,7 @@ def compare(job: Comparison) -> None:
         UserError: a model, the data or a video that cannot be used.
     """
     asked = job.asked
-    device = config.device(asked.accelerator)
+    device = device_of(asked.accelerator)
     contents = [checkpoints.load(file, asked.trust) for file in job.files]
     captions = asked.names or _captions(job.files, contents)
     models, failed = [], dict[Source, str]()

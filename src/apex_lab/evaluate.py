@@ -18,7 +18,10 @@ from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import PathText, did_you_mean, sentence, shown, validate
 from apex_lab.config import command_line as cli
-from apex_lab.config import schema as config
+from apex_lab.config.building import build_model
+from apex_lab.config.building import device as device_of
+from apex_lab.config.job import refuse_missing
+from apex_lab.config.schema import PathsPart
 from apex_lab.evaluation import OF_SCENES, Export, ScoringPart
 from apex_lab.evaluation.checkpoint import Request, evaluate_checkpoint, load, refuse_without_posterior
 from apex_lab.evaluation.files import Bad, find, listed, look
@@ -57,7 +60,7 @@ class EvaluateConfig(BaseModel):
     seed: int = Field(default=0, ge=0)
     trust: bool = False
     scoring: ScoringPart
-    paths: config.PathsPart
+    paths: PathsPart
 
 
 OF_CHECKPOINTS: dict[str, Any] = {
@@ -113,7 +116,7 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
         raise UserError(f"evaluation.* are keys of training: here write {words}.")
     asked = validate(EvaluateConfig, raw, "")
     assert isinstance(asked, EvaluateConfig)
-    config.refuse_missing(raw)
+    refuse_missing(raw)
     if asked.checkpoint is None and asked.predictions is None:
         raise UserError("checkpoint is missing: write checkpoint=... or, for another program's, predictions=...")
     if asked.checkpoint is not None and asked.predictions is not None:
@@ -130,7 +133,7 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
         raise UserError(
             "scoring.resize = truth scores masks of the model's size, export writes the video's: leave one out."
         )
-    config.device(asked.accelerator)
+    device_of(asked.accelerator)
     files, bad = find([asked.checkpoint] if isinstance(asked.checkpoint, str) else asked.checkpoint or [])
     if not files:
         raise UserError("checkpoint = [] names no file: give a .ckpt file or a run folder.")
@@ -140,7 +143,7 @@ def check_evaluation(raw: dict[str, Any], choices: Mapping[str, str], overrides:
     if len(files) + len(bad) == 1 and good:
         _, stored = load(files[0], asked.paths, data, asked.trust)
         if asked.scoring.masks == "posterior":
-            refuse_without_posterior(config.build_model(stored.config), files[0])
+            refuse_without_posterior(build_model(stored.config), files[0])
     bad |= unread
     if not good:
         raise UserError(next(iter(bad.values())) if len(bad) == 1 else listed(bad, len(bad)))

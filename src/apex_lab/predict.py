@@ -20,7 +20,9 @@ from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import make_folder, unwritable
 from apex_lab.base.validation import PathText, validate
 from apex_lab.config import command_line as cli
-from apex_lab.config import schema as config
+from apex_lab.config.building import device as device_of
+from apex_lab.config.job import refuse_missing
+from apex_lab.config.schema import PathsPart
 from apex_lab.prediction.load import digest_of, one_file, segmenter_of
 from apex_lab.prediction.work import Wanted, Weights, predict_video, unique_names
 from apex_lab.runs import checkpoints
@@ -52,7 +54,7 @@ class PredictConfig(BaseModel):
     accelerator: Literal["auto", "cpu", "gpu"]
     trust: bool
     model: dict[str, Any] = Field(default_factory=dict)
-    paths: config.PathsPart
+    paths: PathsPart
 
 
 @dataclass(frozen=True)
@@ -98,14 +100,14 @@ def check_prediction(raw: dict[str, Any], choices: Mapping[str, str], overrides:
     """
     asked = validate(PredictConfig, {key: value for key, value in raw.items() if key != "hydra"}, "")
     assert isinstance(asked, PredictConfig)
-    config.refuse_missing(raw)
+    refuse_missing(raw)
     if asked.checkpoint is None:
         raise UserError("checkpoint is missing: write checkpoint=apex-p2d-cpu, or a .ckpt file or run folder.")
     if asked.video is None:
         raise UserError("video is missing: write video=FILE, a folder of pictures, a pattern with * or a camera (0).")
     if not (asked.overlay or asked.masks or asked.tracks or asked.table):
         raise UserError("overlay, masks, tracks and table are all switched off: leave one on.")
-    config.device(asked.accelerator)
+    device_of(asked.accelerator)
     if asked.overlay:
         ffmpeg()
     patterns = asked.video if isinstance(asked.video, list) else [asked.video]
@@ -124,7 +126,7 @@ def predict(job: Prediction) -> None:
     """
     asked = job.asked
     content = checkpoints.load(job.file, asked.trust)
-    segmenter = segmenter_of(job.file, content, config.device(asked.accelerator), asked.fit, changes=asked.model)
+    segmenter = segmenter_of(job.file, content, device_of(asked.accelerator), asked.fit, changes=asked.model)
     weights = Weights(job.file, digest_of(job.file), asked.model)
     model = type(segmenter.predictor.model).__name__
     if not segmenter.tracks:

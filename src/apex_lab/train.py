@@ -25,9 +25,12 @@ from apex_lab.base.interrupts import Interrupted, deferring, interruptible
 from apex_lab.base.validation import one_line
 from apex_lab.config import command_line as cli
 from apex_lab.config import components, initial, trust
+from apex_lab.config.building import build_model, build_schedules
+from apex_lab.config.building import device as device_of
 from apex_lab.config.composition import CHOICES
-from apex_lab.config.schema import InitialPart, Job, build_model, build_schedules, check_job, needs_labels, reseeded
-from apex_lab.config.schema import device as device_of
+from apex_lab.config.consistency import needs_labels
+from apex_lab.config.job import Job, check_job, reseeded
+from apex_lab.config.schema import InitialPart
 from apex_lab.config.upgrades import fingerprint
 from apex_lab.data import VideoSource, whole_loader
 from apex_lab.inference.predictor import Predictor

@@ -17,7 +17,7 @@ import lightning as L
 from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
 from apex_lab.config import command_line as cli
-from apex_lab.config.schema import Job
+from apex_lab.config.job import Job
 from apex_lab.train import train
 from apex_lab.training import ranks
 from apex_lab.tuning.study import Study, check_study, is_of_study

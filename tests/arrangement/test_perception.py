@@ -10,7 +10,7 @@ import torch
 
 from apex_lab.arrangement.perception import ModelPerception, Oracle, Untrained, detections
 from apex_lab.base.errors import UserError
-from apex_lab.config.schema import build_model, build_schedules
+from apex_lab.config.building import build_model, build_schedules
 from apex_lab.inference.predictor import Predictor
 from apex_lab.models.yardsticks import ColorClusters, OneSegment
 from apex_lab.models.yardsticks import Oracle as Labels

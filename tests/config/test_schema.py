@@ -9,8 +9,8 @@ import pytest
 import yaml
 
 from apex_lab.base.errors import UserError
+from apex_lab.config.building import build_model
 from apex_lab.config.composition import conf_dir
-from apex_lab.config.schema import build_model
 from tests.conftest import REPOSITORY, Ended, compose_job
 
 NEEDED = {"video": ["data.path=videos"], "own_video": ["data=video", "data.path=videos"]}

@@ -12,8 +12,9 @@ import pytest
 import torch
 import yaml
 
-import apex_lab.train  # noqa: F401 - before the schema is patched, whose names it imports
+from apex_lab.config import job as jobs
 from apex_lab.config import schema, upgrades
+from apex_lab.config.building import build_model
 from apex_lab.config.upgrades import ADDED, FORMAT, fingerprint, upgraded
 from apex_lab.runs import checkpoints
 from tests.conftest import REPOSITORY, Ended, compose_job
@@ -37,7 +38,7 @@ def with_dummy_key(monkeypatch: pytest.MonkeyPatch) -> None:
     class Config(schema.Config):
         trainer: Trainer
 
-    monkeypatch.setattr(schema, "Config", Config)
+    monkeypatch.setattr(jobs, "Config", Config)
     monkeypatch.setitem(ADDED, "trainer.dummy", 7)
 
 
@@ -68,8 +69,8 @@ def test_with_a_new_key_a_finished_run_is_found(command: Callable[..., Ended], t
 @pytest.mark.usefixtures("with_dummy_key")
 def test_with_a_new_key_the_shipped_checkpoint_loads(command: Callable[..., Ended], tmp_path: Path) -> None:
     content = checkpoints.load(SHIPPED)
-    job = schema.check_job(content["config"], content["choices"], needs_recipe=False)
-    schema.build_model(job.config).load_state_dict(content["inference"]["weights"])
+    job = jobs.check_job(content["config"], content["choices"], needs_recipe=False)
+    build_model(job.config).load_state_dict(content["inference"]["weights"])
     assert job.config.trainer.dummy == 7  # type: ignore[attr-defined]
 
 

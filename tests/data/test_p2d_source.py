@@ -12,7 +12,8 @@ import torch
 import yaml
 
 from apex_lab.base.errors import UserError
-from apex_lab.config.schema import components, conf_dir
+from apex_lab.config import components
+from apex_lab.config.composition import conf_dir
 from apex_lab.data import P2DSource, recorded, training_loader, whole_loader
 from apex_lab.data import p2d_source as code
 from sims.p2d.settings import Settings

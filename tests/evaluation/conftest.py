@@ -11,9 +11,9 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import write_json
 from apex_lab.base.interrupts import Interrupted
+from apex_lab.config.building import build_model
 from apex_lab.config.command_line import CONFIG_ERROR, RUN_ERROR
 from apex_lab.config.composition import plain
-from apex_lab.config.schema import build_model
 from apex_lab.evaluate import check_evaluation, evaluate
 from apex_lab.runs import checkpoints
 from tests.conftest import REPOSITORY, Ended, compose_job

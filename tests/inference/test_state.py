@@ -11,7 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from apex_lab.config.schema import build_model, build_schedules
+from apex_lab.config.building import build_model, build_schedules
 from apex_lab.inference.state import leaves, refilled
 from apex_lab.nn.noise import VideoNoise
 from apex_lab.scene import Context, Scene, Statistics, schedule_at

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import pytest
 
-from apex_lab.config.schema import build_model
+from apex_lab.config.building import build_model
 from tests.conftest import REPOSITORY, compose_job
 from tests.models.contract import CHECKS, Case, Check, name_of
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from apex_lab.config.schema import build_model, build_schedules
+from apex_lab.config.building import build_model, build_schedules
 from apex_lab.nn import splitting as parts
 from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import Context, schedule_at

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from apex_lab.config.schema import Job
+from apex_lab.config.job import Job
 from apex_lab.config.upgrades import EXCLUDED, fingerprint
 from apex_lab.runs.folder import Run, group_name, run_folder
 from tests.conftest import compose_job

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from apex_lab.base import progress
-from apex_lab.config.schema import build_model
+from apex_lab.config.building import build_model
 from apex_lab.scene import Context, Scene
 from apex_lab.training import estimate
 from tests.conftest import compose_job

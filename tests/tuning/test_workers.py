@@ -19,7 +19,7 @@ from optuna.trial import TrialState
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted
 from apex_lab.config.composition import conf_dir, plain
-from apex_lab.config.schema import Job
+from apex_lab.config.job import Job
 from apex_lab.runs.folder import Busy, run_folder
 from apex_lab.tuning import trial as one_trial
 from apex_lab.tuning import workers

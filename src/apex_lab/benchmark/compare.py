@@ -22,8 +22,9 @@ from apex_lab.base.errors import UserError
 from apex_lab.benchmark.child import death
 from apex_lab.benchmark.measure import once, spread
 from apex_lab.benchmark.work import Workload
+from apex_lab.config.building import build_model
 from apex_lab.config.composition import conf_dir
-from apex_lab.config.schema import Config, build_model
+from apex_lab.config.schema import Config
 from apex_lab.scene import SceneModel
 
 MODEL = "model"

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from apex_lab.config.schema import (
-    Config,
+from apex_lab.config.building import (
     build_clip_frames,
     build_lr_scale,
     build_model,
@@ -16,6 +15,7 @@ from apex_lab.config.schema import (
     build_schedules,
     build_weights,
 )
+from apex_lab.config.schema import Config
 from apex_lab.inference.predictor import Predictor
 from apex_lab.scene import SceneModel, Statistics
 from apex_lab.training.update import Mode, WeightUpdate, named_parameters, remember_rates

@@ -34,7 +34,7 @@ MANY = 200
 def listed(overrides: Sequence[str], config_dir: str | None = None) -> list[Composed]:
     """Composes every job that `apex_lab.train` would start with `-m`, for commands that read what runs left behind.
 
-    Values are not checked (that needs PyTorch): `apex_lab.config.schema.check_job` does that.
+    Values are not checked (that needs PyTorch): `apex_lab.config.job.check_job` does that.
 
     Args:
         overrides: the words of the command.
@@ -74,12 +74,12 @@ def plain_fingerprints(jobs: Sequence[tuple[str, ...]], config_dir: str | None =
 
 
 def check_training(raw: dict[str, Any], choices: Mapping[str, str], words: Sequence[str]) -> Any:
-    """`apex_lab.config.schema.check_job`, imported when it is needed.
+    """`apex_lab.config.job.check_job`, imported when it is needed.
 
     Raises:
         UserError: what is wrong, in one sentence.
     """
-    from apex_lab.config.schema import check_job  # imports PyTorch, which most commands that read runs never need
+    from apex_lab.config.job import check_job  # imports PyTorch, which most commands that read runs never need
 
     return check_job(raw, choices, words)
 

@@ -19,7 +19,9 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, read_json, unwritable
 from apex_lab.base.validation import one_line, sentence
 from apex_lab.config import components
-from apex_lab.config import schema as config
+from apex_lab.config.building import device as device_of
+from apex_lab.config.job import Job, check_job
+from apex_lab.config.schema import PathsPart
 from apex_lab.data import VideoSource, whole_loader
 from apex_lab.evaluation.export import export_path
 from apex_lab.evaluation.files import here, of_another_version
@@ -50,7 +52,7 @@ class Request:
     again: bool
     accelerator: str
     folder: Path | None
-    paths: config.PathsPart
+    paths: PathsPart
     data: OtherData = field(default_factory=OtherData)
     batch_size: int = 4
     chunk: int | None = None
@@ -59,8 +61,8 @@ class Request:
 
 
 def load(
-    file: Path, paths: config.PathsPart, data: OtherData | None = None, trusted: bool = False
-) -> tuple[dict[str, Any], config.Job]:
+    file: Path, paths: PathsPart, data: OtherData | None = None, trusted: bool = False
+) -> tuple[dict[str, Any], Job]:
     """A checkpoint and the checked configuration that made it, with the folders of this machine.
 
     Args:
@@ -75,7 +77,7 @@ def load(
     content = checkpoints.load(file, trusted)
     stored = here(file, content["config"], paths, trusted)
     try:
-        job = config.check_job(stored, content["choices"], to_train=False)
+        job = check_job(stored, content["choices"], to_train=False)
     except UserError as error:
         raise of_another_version(file, error) from error
     if data:
@@ -131,12 +133,12 @@ def _evaluate(
     request: Request,
     file: Path,
     content: Mapping[str, Any],
-    job: config.Job,
+    job: Job,
     model: SceneModel,
     digest: str,
     folder: Path,
 ) -> None:
-    device = config.device(request.accelerator)
+    device = device_of(request.accelerator)
     source = components.build(job.config.data, "data")
     if not isinstance(source, VideoSource):
         raise UserError(f"data._target_ = {job.config.data['_target_']!r} is not an apex_lab.data.VideoSource.")
@@ -200,7 +202,7 @@ def _folder(
     request: Request,
     file: Path,
     content: Mapping[str, Any],
-    job: config.Job,
+    job: Job,
     model: SceneModel,
     digest: str,
     alone: bool,

@@ -11,7 +11,7 @@ from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.validation import one_line, sentence, validate
 from apex_lab.config import components, limits
-from apex_lab.config import schema as config
+from apex_lab.config.schema import Config, PathsPart
 from apex_lab.evaluation.other_data import OtherData
 from apex_lab.inference.loading import changed
 from apex_lab.runs import checkpoints
@@ -25,7 +25,7 @@ __all__ = ["Bad", "find", "here", "listed", "look", "of_another_version"]
 
 def look(
     files: Sequence[Path],
-    paths: config.PathsPart,
+    paths: PathsPart,
     data: OtherData | None = None,
     trusted: bool = False,
     batch_size: int = 1,
@@ -69,7 +69,7 @@ def look(
     return good, bad
 
 
-def here(file: Path, stored: Mapping[str, Any], paths: config.PathsPart, trusted: bool) -> dict[str, Any]:
+def here(file: Path, stored: Mapping[str, Any], paths: PathsPart, trusted: bool) -> dict[str, Any]:
     """The configuration of a checkpoint with the folders of this machine.
 
     A checkpoint may name another folder for its data. What lies there is read; nothing is made there unless the file is
@@ -114,6 +114,6 @@ def _stamp(file: Path) -> tuple[int, int] | None:
 
 def _checked(file: Path, stored: Mapping[str, Any]) -> None:
     try:
-        validate(config.Config, stored, "")
+        validate(Config, stored, "")
     except UserError as error:
         raise of_another_version(file, error) from error

@@ -33,7 +33,8 @@ from apex_lab.base.machine import bounded_memory
 from apex_lab.base.outlines import outline
 from apex_lab.base.validation import LARGEST, shown
 from apex_lab.config import components, trust
-from apex_lab.config.schema import Config, build_schedules
+from apex_lab.config.building import build_schedules
+from apex_lab.config.schema import Config
 from apex_lab.config.upgrades import FORMAT, upgraded
 from apex_lab.runs.record import Kept
 from apex_lab.scene import SceneModel

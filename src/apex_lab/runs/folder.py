@@ -28,7 +28,7 @@ from filelock import FileLock, Timeout
 from apex_lab.base import console
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import drafts, make_folder, read_json, set_aside, unwritable, write_json, write_text
-from apex_lab.config.schema import Job
+from apex_lab.config.job import Job
 from apex_lab.config.upgrades import FORMAT, fingerprint
 from apex_lab.runs import identity, provenance
 from apex_lab.runs.record import read_record

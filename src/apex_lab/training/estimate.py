@@ -11,7 +11,8 @@ from apex_lab.base import faults
 from apex_lab.base.errors import UserError
 from apex_lab.base.machine import bounded_memory
 from apex_lab.base.progress import readable
-from apex_lab.config.schema import Config, build_clip_frames, build_schedules, build_weights
+from apex_lab.config.building import build_clip_frames, build_schedules, build_weights
+from apex_lab.config.schema import Config
 from apex_lab.scene import Context, Noise, SceneModel, schedule_at
 from apex_lab.training.update import WeightUpdate, named_parameters, remember_rates
 

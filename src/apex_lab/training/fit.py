@@ -15,14 +15,8 @@ from lightning.pytorch.strategies import DDPStrategy
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted
-from apex_lab.config.schema import (
-    Config,
-    build_clip_frames,
-    build_lr_scale,
-    build_optimizer,
-    build_schedules,
-    build_weights,
-)
+from apex_lab.config.building import build_clip_frames, build_lr_scale, build_optimizer, build_schedules, build_weights
+from apex_lab.config.schema import Config
 from apex_lab.data import VideoSource, training_loader, whole_loader
 from apex_lab.scene import SceneModel
 from apex_lab.training.callbacks import LastValidation, Lockstep, not_restored

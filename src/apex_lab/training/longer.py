@@ -21,7 +21,9 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import replacing
 from apex_lab.base.validation import one_line, sentence, validate
 from apex_lab.config import initial, trust
-from apex_lab.config.schema import Config, Job, build_clip_frames, build_lr_scale, build_schedules, build_weights
+from apex_lab.config.building import build_clip_frames, build_lr_scale, build_schedules, build_weights
+from apex_lab.config.job import Job
+from apex_lab.config.schema import Config
 from apex_lab.config.upgrades import FORMAT, fingerprint
 from apex_lab.runs import checkpoints
 from apex_lab.runs.folder import Run

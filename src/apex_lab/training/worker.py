@@ -15,7 +15,8 @@ from apex_lab.base import console, faults, interrupts
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted
 from apex_lab.config import components, trust
-from apex_lab.config.schema import Config, build_model
+from apex_lab.config.building import build_model
+from apex_lab.config.schema import Config
 from apex_lab.training.fit import fit
 from apex_lab.training.ranks import JOB, Ranks, end_with_parent
 

@@ -15,8 +15,9 @@ from hydra.core.override_parser.types import Quote, QuotedString
 
 from apex_lab.base.errors import UserError
 from apex_lab.config import components, preflight
+from apex_lab.config.building import build_model
 from apex_lab.config.composition import CHOICES
-from apex_lab.config.schema import Job, build_model, check_job
+from apex_lab.config.job import Job, check_job
 from apex_lab.config.upgrades import EXCLUDED, fingerprint
 from apex_lab.runs.folder import run_folder
 from apex_lab.tuning.settings import ELBO, TuneConfig, check_settings

@@ -15,7 +15,7 @@ import optuna
 from apex_lab.base import console
 from apex_lab.base.errors import Busy, UserError
 from apex_lab.base.files import read_json
-from apex_lab.config.schema import Job
+from apex_lab.config.job import Job
 from apex_lab.runs.state import is_whole
 from apex_lab.training.callbacks import Pruned
 from apex_lab.training.learner import Learner

@@ -11,7 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from apex_lab.config.schema import Config, build_model, build_optimizer, build_schedules, build_weights
+from apex_lab.config.building import build_model, build_optimizer, build_schedules, build_weights
+from apex_lab.config.schema import Config
 from apex_lab.models.apex import Apex, FeatureGlimpses, GaussianLikelihood, ImageGlimpses
 from apex_lab.scene import Scene
 from apex_lab.training.update import WeightUpdate, named_parameters, remember_rates

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from apex_lab.config.schema import build_model, build_schedules
+from apex_lab.config.building import build_model, build_schedules
 from apex_lab.models.apex import Apex
 from apex_lab.nn.spatial_transformer import Paster, crop
 from apex_lab.scene import Context, schedule_at

@@ -9,7 +9,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from apex_lab.base.errors import UserError
-from apex_lab.config.schema import build_model
+from apex_lab.config.building import build_model
 from apex_lab.models.op3 import Op3
 from tests.conftest import compose_job
 

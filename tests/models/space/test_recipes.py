@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from apex_lab.config.schema import build_model
+from apex_lab.config.building import build_model
 from apex_lab.models.space import Space
 from apex_lab.runs.checkpoints import inference_part
 from apex_lab.training.schedules import Staircase
