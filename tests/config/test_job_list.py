@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from apex_lab.base.errors import UserError
-from apex_lab.config.composition import composed, composing
+from apex_lab.config.composition import composed, composing, conf_dir
 from apex_lab.config.job_list import Words, expand, sweeps, tables_of
 
 
@@ -83,6 +83,55 @@ def test_a_sweep_is_a_union_of_products(tmp_path: Path) -> None:
     ]
 
 
+EXCEPTIONS = """
+jobs: [{model: [apex, space], seed: [0, 1]}]
+exceptions:
+  - {where: {model: [space, op3], data: p2d, scale: cpu}, set: {+tuned: space, seed: 7}}
+  - {where: {scale: smoke}, set: {seed: [8, 9]}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "jobs"),
+    [
+        # the paper's scale is the usual one, p2d the usual data
+        ((), ["model=apex seed=0", "model=apex seed=1", "model=space seed=0", "model=space seed=1"]),
+        (
+            ("scale=cpu,smoke", "seed=3"),
+            [
+                *("model=apex seed=3 scale=cpu", "model=apex seed=3 scale=smoke"),
+                *("model=space +tuned=space seed=3 scale=cpu", "model=space seed=3 scale=smoke"),
+            ],
+        ),
+        (
+            ("scale=cpu", "data=sprites", "model=space"),
+            [f"model=space seed={n} data=sprites scale=cpu" for n in (0, 1)],
+        ),
+        (("scale=cpu", "model=op3"), ["model=op3 seed=7 +tuned=space scale=cpu"]),
+        (("scale=cpu", "model=op3", "+tuned=sigma"), ["model=op3 seed=7 +tuned=sigma scale=cpu"]),
+        (("scale=smoke", "model=op3"), ["model=op3 seed=8 scale=smoke", "model=op3 seed=9 scale=smoke"]),
+    ],
+)
+def test_exceptions_hold_where_they_say(words: Words, jobs: list[str], tmp_path: Path) -> None:
+    found = listed(tmp_path, {"mine": EXCEPTIONS}, "+sweep=mine", *words)
+    assert sorted(map(sorted, found)) == sorted(sorted(job.split()) for job in jobs)
+
+
+@pytest.mark.usefixtures("hydra")
+@pytest.mark.parametrize("sweep", ["segmentation", "tracking"])
+def test_on_a_cpu_two_seeds_and_baselines_with_tuned_values(sweep: str) -> None:
+    """Each in `conf/tuned/` that is named after a model of the sweep: that is how a baseline's search is called."""
+    assert not any("tuned" in word for job in expand([f"+sweep={sweep}", "scale=paper"]) for word in job)
+    jobs = expand([f"+sweep={sweep}", "scale=cpu"])
+    models = {word.removeprefix("model=") for job in jobs for word in job if word.startswith("model=")}
+    for model in models - {"color_clusters", "background_subtraction", "oracle", "one_segment"}:
+        words = [job for job in jobs if f"model={model}" in job]
+        tuned = (f"+tuned={model}",) if (conf_dir() / "tuned" / f"{model}.yaml").is_file() else ()
+        assert {frozenset(job) for job in words} == {
+            frozenset((f"model={model}", f"seed={seed}", "scale=cpu", *tuned)) for seed in (0, 1)
+        }
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -91,6 +140,8 @@ def test_a_sweep_is_a_union_of_products(tmp_path: Path) -> None:
         ("jobs: {model: apex}", r"mine\.yaml\.jobs = "),
         ("job: [{model: apex}]", r"Unknown key .*job"),
         ("jobs: [{model: {_target_: os.system}}]", r"jobs\.0\.model"),
+        ("{jobs: [{seed: 0}], exceptions: [{where: {modell: a}, set: {}}]}", r"Unknown key .*where\.modell = 'a'"),
+        ("{jobs: [{seed: 0}], exceptions: [{where: {}, set: {+model._target_: os.system}}]}", r"os\.system"),
     ],
 )
 def test_faulty_sweep_files(text: str, told: str, tmp_path: Path) -> None:

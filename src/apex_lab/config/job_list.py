@@ -9,6 +9,9 @@ of its own, and what they make together is the sweep:
     include: [tracking]                                     # and those of another sweep
 
 Keys stand as on the command line. A key that the command gives too has the command's values in every entry.
+
+    exceptions: # jobs of this model on this data at this scale have these values, unless the command gives others
+      - {where: {model: space, data: p2d, scale: cpu}, set: {+tuned: space}}
 """
 
 from __future__ import annotations
@@ -17,8 +20,8 @@ import copy
 import itertools
 import math
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 from hydra import compose
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
@@ -42,21 +45,62 @@ MOST = 100_000
 
 Value = str | int | float | bool | None
 
+Values = dict[str, Value | tuple[Value, ...]]
+"""Key -> value or values."""
+
+
+class Where(BaseModel):
+    """Choices that jobs are told by; None: any."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    model: str | tuple[str, ...] | None = None
+    data: str | tuple[str, ...] | None = None
+    scale: str | tuple[str, ...] | None = None
+
+    def fits(self, chosen: Mapping[str, str]) -> bool:
+        """Whether a job's choices are among these."""
+        asked = {group: getattr(self, group) for group in Where.model_fields}
+        return all(
+            chosen[group] in ((words,) if isinstance(words, str) else words)
+            for group, words in asked.items()
+            if words is not None
+        )
+
+
+class ExceptionPart(BaseModel):
+    """Values of some of a file's jobs, in place of those of their entries or beside them."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    where: Where
+    set: Values
+
 
 class SweepFile(BaseModel):
     """What a file in conf/sweep/ may hold.
 
     Attributes:
-        jobs: entries: key -> value or values.
+        jobs: entries.
+        exceptions: for its own entries, later ones over earlier ones.
         include: other sweeps.
         tables: numbers of the paper's tables that it makes; None: all that are made from scores.
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    jobs: tuple[dict[str, Value | tuple[Value, ...]], ...] = ()
+    jobs: tuple[Values, ...] = ()
+    exceptions: tuple[ExceptionPart, ...] = ()
     include: tuple[str, ...] = ()
     tables: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry of a sweep file: key -> the words of its values; exceptions likewise."""
+
+    words: dict[str, list[str]]
+    exceptions: tuple[tuple[Where, dict[str, list[str]]], ...] = ()
 
 
 def expand(overrides: Sequence[str], extra: Sequence[str] = ()) -> list[Words]:
@@ -94,7 +138,8 @@ def expand(overrides: Sequence[str], extra: Sequence[str] = ()) -> list[Words]:
     jobs: list[Words] = []
     for name in sweeps:
         for entry in read_sweep(name, extra):
-            jobs += _product(entry, given)
+            for words, own in _with_exceptions(entry, given, extra):
+                jobs += _product(words, own)
     return list({frozenset(job): job for job in jobs}.values())
 
 
@@ -117,6 +162,24 @@ def _product(entry: Mapping[str, Sequence[str]], given: Mapping[str, Sequence[st
     return [tuple(job) for job in itertools.product(*lists)]
 
 
+def _with_exceptions(
+    entry: Entry, given: Mapping[str, Sequence[str]], extra: Sequence[str]
+) -> Iterator[tuple[Mapping[str, Sequence[str]], Mapping[str, Sequence[str]]]]:
+    """An entry and a command's words, split by what exceptions look at: each part with the values that it has."""
+    if not entry.exceptions:
+        yield entry.words, given
+        return
+    usual = compose("train", overrides=list(extra), return_hydra_config=True).hydra.runtime.choices
+    lists = [given.get(g) or entry.words.get(g) or [f"{g}={usual[g]}"] for g in Where.model_fields]
+    for words in itertools.product(*lists):
+        chosen = dict(word.split("=", 1) for word in words)
+        one = {group: [f"{group}={word}"] for group, word in chosen.items()}
+        found = entry.words | {group: one[group] for group in entry.words if group in one}
+        for where, values in entry.exceptions:
+            found |= values if where.fits(chosen) else {}
+        yield found, {key: one.get(key, values) for key, values in given.items()}
+
+
 def _values(override: Override) -> list[str]:
     """All values of one word as they stand on a command line.
 
@@ -137,8 +200,8 @@ def _values(override: Override) -> list[str]:
     return values
 
 
-def read_sweep(name: str, extra: Sequence[str] = (), seen: Words = ()) -> list[dict[str, list[str]]]:
-    """The entries of a sweep file and of those that it includes: key -> the words of its values.
+def read_sweep(name: str, extra: Sequence[str] = (), seen: Words = ()) -> list[Entry]:
+    """The entries of a sweep file and of those that it includes.
 
     Raises:
         UserError: it is not there, includes itself, or holds what it may not.
@@ -148,8 +211,10 @@ def read_sweep(name: str, extra: Sequence[str] = (), seen: Words = ()) -> list[d
     file = _read(name, extra)
     if not file.jobs and not file.include:
         raise UserError(f"{_place(name)} lists no jobs.")
-    entries = [{key: _listed(key, value) for key, value in entry.items()} for entry in file.jobs]
-    trust.only_words((word for entry in entries for words in entry.values() for word in words), _place(name))
+    exceptions = tuple((each.where, _worded(each.set)) for each in file.exceptions)
+    entries = [Entry(_worded(entry), exceptions) for entry in file.jobs]
+    worded = [*(entry.words for entry in entries), *(values for _, values in exceptions)]
+    trust.only_words((word for entry in worded for words in entry.values() for word in words), _place(name))
     for other in file.include:
         entries += read_sweep(other, extra, (*seen, name))
     return entries
@@ -185,10 +250,10 @@ def _place(name: str) -> str:
     return f"conf/sweep/{name}.yaml"
 
 
-def _listed(key: str, value: Any) -> list[str]:
-    """The words of one key of an entry."""
-    values = value if isinstance(value, tuple) else (value,)
-    return [f"{key}={_word(one)}" for one in values]
+def _worded(values: Values) -> dict[str, list[str]]:
+    """Key -> the words of its values."""
+    lists = {key: value if isinstance(value, tuple) else (value,) for key, value in values.items()}
+    return {key: [f"{key}={_word(one)}" for one in several] for key, several in lists.items()}
 
 
 def _word(value: Value) -> str:

@@ -78,7 +78,9 @@ class Tables:
         if self.asked.folder is not None:
             return Path(self.asked.folder)
         named = [word for group in ("data", "scale") for word in dict.fromkeys(j.choices[group] for j in self.jobs)]
-        changes = list(dict.fromkeys(word.lstrip("+") for job in self.jobs for word in job.changes))
+        asked = {_key(word) for word in self.words}  # what a sweep changes by itself is known by its name
+        changed = (word.lstrip("+") for job in self.jobs for word in job.changes)
+        changes = list(dict.fromkeys(word for word in changed if _key(word) in asked))
         words = "_".join([*sweeps(self.words), *named, *changes])
         outputs = str(self.jobs[0].raw["paths"]["outputs"])
         return Path(outputs) / "tables" / re.sub(r"[^\w.=,+-]+", "-", words)[:150]
