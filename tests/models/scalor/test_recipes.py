@@ -27,7 +27,7 @@ def merged(scale: str, *further: str) -> dict[str, Any]:
     ("scale", "further", "size"),
     [
         ("paper", [], FreeSize),
-        ("cpu", ["recipe/scalor/cpu_for/p2d.yaml"], FreeSize),
+        ("cpu", ["recipe/scalor/cpu_for/p2d.yaml"], AnchoredSize),
         ("cpu", ["recipe/scalor/cpu_for/sprites.yaml"], AnchoredSize),
         ("quickstart", [], FreeSize),
         ("smoke", [], FreeSize),
