@@ -44,7 +44,13 @@ class BroadcastDecoder(nn.Module):
 
     def _drawn(self, by_latent: Tensor, by_place: Tensor) -> Float[Tensor, "m 3 H W"]:
         """`others` and `head`, image by image; the running statistics follow."""
-        layers = [(layer[0], layer[1]) for layer in self.others]
+        layers: list[tuple[nn.Conv2d, nn.BatchNorm2d]] = []
+        for layer in self.others:
+            assert isinstance(layer, nn.Sequential)
+            conv, norm, _ = layer
+            assert isinstance(conv, nn.Conv2d)
+            assert isinstance(norm, nn.BatchNorm2d)
+            layers.append((conv, norm))
         drawn, statistics = draw(by_latent, cpu_layout(by_place), layers, self.head)
         for (_, norm), found in zip(layers, statistics, strict=True):
             update_running(norm, *found)

@@ -18,11 +18,11 @@ from torch import Tensor, nn
 
 
 class Statistics(NamedTuple):
-    """Mean and biased variance of a layer's channels before normalisation, each (C,), of `count` values a channel."""
+    """Mean and biased variance of a layer's channels before normalisation, each (C,), of `number` values a channel."""
 
     mean: Tensor
     variance: Tensor
-    count: int
+    number: int
 
 
 class Scaled(NamedTuple):
@@ -53,8 +53,8 @@ def draw(
         [norm.eps for _, norm in layers], by_latent, by_place, head.weight, head.bias, *weights
     )
     area = by_place.shape[-1]
-    counts = [len(by_latent) * (area - 2 * (i + 1)) ** 2 for i in range(len(layers))]
-    return drawn, [Statistics(*both, n) for *both, n in zip(found[::2], found[1::2], counts, strict=True)]
+    numbers = [len(by_latent) * (area - 2 * (i + 1)) ** 2 for i in range(len(layers))]
+    return drawn, [Statistics(found[2 * i], found[2 * i + 1], number) for i, number in enumerate(numbers)]
 
 
 class _Stack(torch.autograd.Function):
