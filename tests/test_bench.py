@@ -23,6 +23,7 @@ from apex_lab import bench
 from apex_lab.base.errors import UserError
 from apex_lab.benchmark import child, compare
 from apex_lab.benchmark import printed as report
+from apex_lab.benchmark.arithmetic import counted_by_part, shares
 from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.profile import REST, seconds_by_part
 from apex_lab.benchmark.work import Workload
@@ -372,3 +373,29 @@ def test_the_compiled_step_is_measured_in_a_process_of_its_own() -> None:
     assert row["unavailable"] is None
     assert row["graph_breaks"] == 0
     assert row["graphs"] == 1
+
+
+def test_flops_are_counted_by_part_and_backward_and_without_a_graph() -> None:
+    x, convolution = torch.rand(2, 3, 8, 8), torch.nn.Conv2d(3, 5, 3, padding=1)
+    linear = torch.nn.Linear(6, 7)
+    of_image, of_rows = 2 * 2 * 5 * 3 * 9 * 64, 2 * 4 * 6 * 7
+
+    def step() -> None:
+        with torch.profiler.record_function("outer"):
+            with torch.profiler.record_function("inner"):
+                found = convolution(x)
+            time.sleep(0.05)
+            with torch.no_grad():
+                linear(torch.rand(4, 6))
+        found.sum().backward()
+
+    parts = counted_by_part(step)
+    assert {name: work.flops for name, work in parts.items()} == {"outer": of_rows, "inner": of_image, REST: of_image}
+    assert all(0 <= work.seconds < 1 for work in parts.values())
+
+
+def test_a_matrix_product_runs_at_its_own_rate() -> None:
+    square = torch.rand(1024, 1024)
+    found = shares(lambda: square @ square, HERE, {})
+    assert found["flops"] == {REST: 2 * 1024**3}
+    assert 0.3 < found["share"] < 1.5

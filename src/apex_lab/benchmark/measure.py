@@ -15,6 +15,7 @@ from torch._dynamo.exc import TorchDynamoException
 from torch._dynamo.utils import counters
 
 from apex_lab.base.validation import one_line
+from apex_lab.benchmark.arithmetic import shares
 from apex_lab.benchmark.profile import seconds_by_part
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.schema import Config
@@ -82,6 +83,7 @@ def measure(case: Case) -> dict[str, Any]:
         row["graphs"] = counters["stats"]["unique_graphs"]
     elif case.by_part:
         row["parts"] = parts(work, case)
+        row["arithmetic"] = shares(step, device, row["parts"])
     if device.type == "cuda":
         row |= kernels(step)
     return row

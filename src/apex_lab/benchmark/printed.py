@@ -61,7 +61,7 @@ def comparison(compared: Row) -> str:
 
 
 def tables(rows: Sequence[Row]) -> list[str]:
-    """All rows, then the seconds by part of those that have parts."""
+    """All rows, then seconds by part and share of the matrix-product rate of those that have parts."""
     measured = [row for row in rows if row["unavailable"] is None]
     header = ["", "frames/s", "seconds", "peak memory"]
     lines = [
@@ -77,7 +77,25 @@ def tables(rows: Sequence[Row]) -> list[str]:
         ]
         total = ["sum", *(f"{sum(row['parts'].values()):.3f}" for row in by_part)]
         made.append(_table([["seconds by part", *(name(row) for row in by_part)], *lines, total]))
+        made.append(_arithmetic(by_part, names))
     return made
+
+
+def _arithmetic(rows: Sequence[Row], names: Sequence[str]) -> str:
+    """FLOPs by part, and which share of the rate of a plain matrix product the part runs at."""
+    found = [row["arithmetic"] for row in rows]
+    header = ["GFLOP, share of the matrix-product rate", *(name(row) for row in rows)]
+    lines = [
+        [part, *(_work(of["flops"][part], of["shares"][part]) if part in of["flops"] else "" for of in found)]
+        for part in names
+    ]
+    total = ["all", *(_work(sum(of["flops"].values()), of["share"]) for of in found)]
+    rate = ["the rate in GFLOP/s", *(f"{of['matrix_rate'] / 1e9:.4g}" for of in found)]
+    return _table([header, *lines, total, rate])
+
+
+def _work(flops: int, share: float) -> str:
+    return f"{flops / 1e9:.4g}, {share:.0%}"
 
 
 def _table(lines: Sequence[Sequence[str]]) -> str:

@@ -7,7 +7,7 @@ take the place of the costliest layer of a spatial broadcast decoder (Watters et
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -38,6 +38,23 @@ def border_classes(size: int, kernel: int) -> Float[Tensor, "kernel size"]:
     return F.one_hot(found, kernel).T.float()
 
 
+class _Spread(torch.autograd.Function):
+    """Values of the border classes (N, classes, C) and `still` (pixels, C) -> their sum at every pixel (N, pixels, C).
+
+    Forward it is a copy, backward a product with the one-hot `classes` (classes, pixels): each is the faster one.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, still: Tensor, classes: Tensor, index: Tensor) -> Tensor:  # type: ignore[override]
+        ctx.save_for_backward(classes)
+        return values.index_select(1, index).add_(still)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None, None]:  # type: ignore[override]
+        (classes,) = ctx.saved_tensors
+        return torch.bmm(classes.expand(len(gradient), -1, -1), gradient), gradient.sum(0), None, None
+
+
 class TiledWeights(NamedTuple):
     """What a `TiledConv` needs of its weights: the same for all vectors, so computed once per forward pass.
 
@@ -63,6 +80,7 @@ class TiledConv(nn.Conv2d):
     """
 
     classes: Tensor
+    index: Tensor
     taps: Tensor
     coordinates: Tensor
 
@@ -73,6 +91,7 @@ class TiledConv(nn.Conv2d):
         axis = border_classes(size, kernel)
         self.vector, self.size = vector, size
         self.register_buffer("classes", torch.kron(axis, axis), persistent=False)  # (kernel^2, H W)
+        self.register_buffer("index", self.classes.argmax(0), persistent=False)  # (H W)
         self.register_buffer("taps", border_taps(kernel), persistent=False)
         self.register_buffer("coordinates", coordinate_maps(size), persistent=False)
 
@@ -88,8 +107,7 @@ class TiledConv(nn.Conv2d):
     ) -> Float[Tensor, "N pixels C"]:
         """Vectors -> the convolution's result, pixels in rows from the top, channels last."""
         values = (vector @ weights.by_class).unflatten(1, (len(self.classes), self.out_channels))
-        classes = self.classes.T.expand(len(vector), -1, -1)
-        return torch.baddbmm(weights.still.expand(len(vector), -1, -1), classes, values)
+        return _Spread.apply(values, weights.still, self.classes, self.index)
 
     def pull_back(self, gradient: Float[Tensor, "N pixels C"], weights: TiledWeights) -> Float[Tensor, "N Z"]:
         """Gradient with respect to the result -> gradient with respect to the vectors."""

@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from apex_lab.models.op3 import Op3
-from apex_lab.models.op3.decoder import Decoder
+from apex_lab.models.op3.decoder import Decoder, conv_by_pairs
 from apex_lab.models.op3.dynamics import Dynamics
 from apex_lab.models.op3.likelihood import image_gradients, mixture
 from apex_lab.models.op3.plan import Plan, listed
@@ -342,3 +342,15 @@ def test_a_slot_alone_has_no_effects() -> None:
     turned = dynamics(slots[:, order])
     torch.testing.assert_close(turned.deterministic, together.deterministic[:, order])
     torch.testing.assert_close(turned.stochastic.mean, together.stochastic.mean[:, order])
+
+
+@pytest.mark.parametrize("width", [6, 7])
+def test_pairs_of_columns_give_the_plain_convolution(width: int) -> None:
+    conv = torch.nn.Conv2d(3, 4, 5, padding=2).double()
+    x = torch.randn(2, 3, 5, width, dtype=torch.float64, requires_grad=True)
+    weigh = torch.randn(2, 4, 5, width, dtype=torch.float64)
+    found, expected = conv_by_pairs(x, conv), conv(x)
+    torch.testing.assert_close(found, expected)
+    of = [x, conv.weight, conv.bias]
+    for mine, plain in zip(*(torch.autograd.grad((y * weigh).sum(), of) for y in (found, expected)), strict=True):
+        torch.testing.assert_close(mine, plain)

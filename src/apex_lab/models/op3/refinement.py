@@ -162,15 +162,16 @@ class Refinement(nn.Module):
         of_shared, of_own = (torch.cat([first.weight[:, part] for part in parts], dim=1) for parts in (SHARED, OWN))
         shared = F.conv2d(self._shared(seen), of_shared, first.bias, padding=KERNEL // 2)
         own = F.conv2d(self._own(seen), of_own, padding=KERNEL // 2)
-        k = len(own) // len(shared)
-        x = F.elu(own + shared.repeat_interleave(k, 0), inplace=True)
+        # in place, so that the sum has the layout of `own`
+        x = F.elu(own.unflatten(0, (len(shared), -1)).add_(shared[:, None]).flatten(0, 1), inplace=True)
         for conv in others[:-1]:
             x = F.elu(conv(x), inplace=True)
         return full(_PooledElu.apply(others[-1](x)))
 
     def _shared(self, seen: Seen) -> Float[Tensor, "B 6 H W"]:
         density = self.norm_density(seen.mixture.density.detach()[:, None])
-        return torch.cat([seen.image, density, self.coordinates.expand(len(density), -1, -1, -1)], dim=1)
+        maps = torch.cat([seen.image, density, self.coordinates.expand(len(density), -1, -1, -1)], dim=1)
+        return maps.contiguous(memory_format=torch.channels_last)
 
     def _own(self, seen: Seen) -> Float[Tensor, "N 11 H W"]:
         masks, by_slot, density = seen.mixture

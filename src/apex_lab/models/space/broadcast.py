@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from apex_lab.models.space.networks import conv_elu, cpu_layout, running, update_running
+from apex_lab.models.space.stack import draw
 from apex_lab.nn.precision import full
 
 
@@ -37,7 +38,23 @@ class BroadcastDecoder(nn.Module):
 
     def forward(self, latent: Float[Tensor, "m latent"]) -> Float[Tensor, "m 3 H W"]:
         by_latent, by_place = self._first(latent)
+        if self.training and latent.device.type == "cpu" and not (_half(latent) or torch.compiler.is_compiling()):
+            return torch.sigmoid(self._drawn(by_latent, by_place))
         return torch.sigmoid(self.head(self.others(F.elu_(by_latent[..., None, None] + cpu_layout(by_place)))))
+
+    def _drawn(self, by_latent: Tensor, by_place: Tensor) -> Float[Tensor, "m 3 H W"]:
+        """`others` and `head`, image by image; the running statistics follow."""
+        layers: list[tuple[nn.Conv2d, nn.BatchNorm2d]] = []
+        for layer in self.others:
+            assert isinstance(layer, nn.Sequential)
+            conv, norm, _ = layer
+            assert isinstance(conv, nn.Conv2d)
+            assert isinstance(norm, nn.BatchNorm2d)
+            layers.append((conv, norm))
+        drawn, statistics = draw(by_latent, cpu_layout(by_place), layers, self.head)
+        for (_, norm), found in zip(layers, statistics, strict=True):
+            update_running(norm, *found)
+        return drawn
 
     def _first(self, latent: Tensor) -> tuple[Float[Tensor, "m width"], Float[Tensor, "1 width h w"]]:
         """`self.first` of the broadcast map, before its ELU, as two summands: of each latent, and of each place.
@@ -63,3 +80,8 @@ class BroadcastDecoder(nn.Module):
                 mean, variance = running(norm)
             gain = norm.weight * torch.rsqrt(variance + norm.eps)
             return by_latent * gain + (norm.bias - mean * gain), by_place * gain[:, None, None]
+
+
+def _half(x: Tensor) -> bool:
+    """Whether convolutions of x run in half precision."""
+    return x.dtype == torch.bfloat16 or torch.is_autocast_enabled(x.device.type)
