@@ -189,8 +189,8 @@ class ObjectNetworks(nn.Module):
         return proposals, drawn, self.rejection.kept(drawn[:, :, -1], windows, mask)
 
     def _drawn(self, what: Float[Tensor, "B K Z"]) -> Float[Tensor, "B K C g g"]:
-        """Masks for the decisions of the loop, which have no gradient; where there is none at all, colours too."""
-        alpha_only = torch.is_grad_enabled()
+        """Masks for the decisions of the loop, which have no gradient; colours too if these drawings are rendered."""
+        alpha_only = torch.is_grad_enabled() and not self.recompute.draws_twice(what)
         with torch.no_grad():
             return self.glimpse_decoder(what, alpha_only)
 
@@ -223,17 +223,22 @@ class ObjectNetworks(nn.Module):
         values = torch.stack([_rendered(step) for step in steps], dim=1)
         slots = steps[0].alive.shape[1]
         full = steps[0].drawn_found.shape[2] > 1
+        drawn = [joined_candidates(step, step.drawn, step.drawn_found) if full else None for step in steps]
         index = torch.arange(values.shape[2], device=values.device).expand(values.shape[:3])
-        if self.training and not full:
+        if self.training and torch.is_grad_enabled():
             present = values[..., 0].detach().flatten(0, 1) > 0
             index, valid = (
                 x.unflatten(0, values.shape[:2]) for x in pack(present, min(self.max_objects, values.shape[2]))
             )
             presence, others = gather_slots(values, index, dim=2).split([1, values.shape[-1] - 1], dim=-1)
             values = torch.cat([presence * valid[..., None], others], dim=-1)
+            if full:
+                drawn = [gather_slots(all_, at) for all_, at in zip(drawn, index.unbind(1), strict=True)]
         curriculum = (schedule["alpha_curriculum"] > 0.5) & (index >= slots)
         counted = torch.where(curriculum, 0.0, 1.0)
-        drawn = [joined_candidates(step, step.drawn, step.drawn_found) if full else None for step in steps]
+        if full and torch.is_grad_enabled():
+            codes = values[..., -self.what :].unbind(1)
+            drawn = [self.glimpse_decoder.again(*each) for each in zip(drawn, codes, strict=True)]
         frames = [
             self.recompute(self._layers, picture, *inputs)
             for picture, *inputs in zip(drawn, values.unbind(1), counted.unbind(1), strict=True)
