@@ -20,7 +20,7 @@ def gather_slots(values: Tensor, source: Int[Tensor, "*batch S"], dim: int = 1) 
 
 
 def leading(valid: Bool[Tensor, "*batch P"]) -> int:
-    """How many leading slots to work on, where the valid ones come first: at least 1, and none that is valid is left out.
+    """How many leading slots to work on, where the valid ones come first: at least 1; no valid one is left out.
 
     On a CPU as many as the fullest row has. A GPU would have to wait for that number, and a CUDA graph or a compiler
     takes one shape only, so there it is all.

@@ -113,8 +113,9 @@ class GlimpseDecoder(nn.Module):
     ) -> Float[Tensor, "*batch 4 g g"]:
         """`forward(what)`, given its values `drawn`, with gradients that keep no activations."""
         flat = what.reshape(-1, what.shape[-1])
-        each = self._each(flat)
-        return redrawn(lambda part: self._decode(part, False), self, each, drawn.reshape(-1, *drawn.shape[-3:]), flat).reshape(drawn.shape)
+        before = drawn.reshape(-1, *drawn.shape[-3:])
+        after = redrawn(lambda part: self._decode(part, False), self, self._each(flat), before, flat)
+        return after.reshape(drawn.shape)
 
     def _each(self, flat: Float[Tensor, "N Z"]) -> int:
         return part_size(len(flat), 16 * self.size**2, flat)
