@@ -4,7 +4,7 @@ python -m apex_lab.bench
 python -m apex_lab.bench scale=cpu data.image_size=128 clips.batch_size=4
 python -m apex_lab.bench +ablation=image_stn trainer=gpu trainer.compile=true
 
-Every row is measured in a process of its own, on random videos: no data set is needed.
+Every row is measured in a process of its own, on videos of moving sprites: no data set is needed.
 """
 
 from __future__ import annotations

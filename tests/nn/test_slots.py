@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.slots import gather_slots, leading, padded
 
 
 def test_gather_slots_along_other_dimensions() -> None:
@@ -20,3 +20,15 @@ def test_gather_slots_along_other_dimensions() -> None:
     got = gather_slots(video, frames, dim=2)
     assert got.shape == (2, 3, 1, 5)
     assert torch.equal(got[1, 1, 0], video[1, 1, 2])
+
+
+def test_leading_slots_hold_all_that_is_valid() -> None:
+    valid = torch.tensor([[True, False, False, False], [True, True, True, False]])
+    assert leading(valid) == 3
+    assert leading(torch.zeros(2, 4, dtype=torch.bool)) == 1
+    assert leading(valid.to("meta")) == 4, "shapes depend on no data but on a CPU"
+    values = torch.rand(2, 3, 5)
+    whole = padded(values, 4)
+    assert torch.equal(whole[:, :3], values)
+    assert float(whole[:, 3:].abs().sum()) == 0
+    assert padded(values, 3) is values

@@ -16,13 +16,19 @@ from apex_lab.config.building import (
     build_weights,
 )
 from apex_lab.config.schema import Config
+from apex_lab.data import Clip, Sprites
 from apex_lab.inference.predictor import Predictor
 from apex_lab.scene import SceneModel, Statistics
 from apex_lab.training.update import Mode, WeightUpdate, named_parameters, remember_rates
 
+COUNTS = (2, 4)
+"""Fewest and most sprites of a video, as in `data=sprites`."""
+
 
 class Workload:
-    """A model, its optimiser and one batch of random clips, all on the device.
+    """A model, its optimiser and one batch of clips of moving sprites, all on the device.
+
+    On random images a model finds no object, and a twin that skips what is not there would have nothing to do.
 
     Args:
         config: the run whose steps are measured; schedules stand where they are in the middle of it.
@@ -43,7 +49,8 @@ class Workload:
     ) -> None:
         side = config.data["image_size"]
         noise = torch.Generator().manual_seed(config.seed)
-        video = torch.randint(0, 256, (batch_size, frames, 3, side, side), dtype=torch.uint8, generator=noise)
+        clips = Sprites(config.seed, "train", batch_size, frames, side, COUNTS)
+        video = torch.stack([clips.read(Clip(i))["video"] for i in range(batch_size)])
         self.device, self.frames, self.video = device, batch_size * frames, video.to(device)
         self.model = build_model(config) if model is None else model
         if model is None:

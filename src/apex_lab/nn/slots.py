@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from jaxtyping import Int
+import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -16,3 +17,23 @@ def gather_slots(values: Tensor, source: Int[Tensor, "*batch S"], dim: int = 1) 
     shape[dim + 1 - source.dim() : dim + 1] = source.shape
     size[dim] = source.shape[-1]
     return values.gather(dim, source.view(shape).expand(size))
+
+
+def leading(valid: Bool[Tensor, "*batch P"]) -> int:
+    """How many leading slots to work on, where the valid ones come first: at least 1; no valid one is left out.
+
+    On a CPU as many as the fullest row has. A GPU would have to wait for that number, and a CUDA graph or a compiler
+    takes one shape only, so there it is all.
+    """
+    slots = valid.shape[-1]
+    if valid.device.type != "cpu" or torch.compiler.is_compiling():
+        return slots
+    return max(1, int(valid.sum(-1).max()))
+
+
+def padded(values: Float[Tensor, "B n ..."], slots: int) -> Float[Tensor, "B P ..."]:
+    """Values of the leading slots -> of all, zero behind them."""
+    b, n = values.shape[:2]
+    if n == slots:
+        return values
+    return torch.cat([values, values.new_zeros(b, slots - n, *values.shape[2:])], dim=1)

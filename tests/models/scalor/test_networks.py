@@ -62,6 +62,23 @@ def test_glimpse_decoder_runs_its_heads_together(size: int) -> None:
         assert apart.shape == (3, 4, size, size)
 
 
+def test_glimpses_drawn_again_have_the_same_gradients() -> None:
+    network = GlimpseDecoder(64, 8, deep_heads=True)
+    generator = torch.Generator().manual_seed(0)
+    what = torch.randn(3, 7, 8, generator=generator)  # 21 glimpses: two parts on a CPU
+    on_drawn = torch.randn(3, 7, 4, 64, 64, generator=generator)
+    found = []
+    for again in (False, True):
+        code = what.clone().requires_grad_()
+        with torch.set_grad_enabled(not again):
+            drawn = network(code)
+        if again:
+            drawn = network.again(drawn, code)
+        found.append((drawn.detach(), *torch.autograd.grad(drawn, [code, *network.parameters()], on_drawn)))
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(a.abs().max()))
+
+
 def test_background_encoder() -> None:
     network = Background(128, 10, "strong").encoder
     check_count("bg_encoder_128", parameters_of(network))

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, same
 from apex_lab.models.scalor.latents import full_precision
+from apex_lab.models.scalor.redraw import redrawn
 from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.spatial_transformer import crop
 from apex_lab.nn.splitting import joined, part_size
@@ -104,9 +105,20 @@ class GlimpseDecoder(nn.Module):
     def forward(self, what: Float[Tensor, "*batch Z"], alpha_only: bool = False) -> Float[Tensor, "*batch C g g"]:
         """Channels: o (RGB), alpha; or alpha alone."""
         flat = what.reshape(-1, what.shape[-1])
-        size = part_size(len(flat), 16 * self.size**2, flat)
-        drawn = joined(self._decode(part, alpha_only) for part in flat.split(size))
+        drawn = joined(self._decode(part, alpha_only) for part in flat.split(self._each(flat)))
         return drawn.reshape(*what.shape[:-1], *drawn.shape[1:])
+
+    def again(
+        self, drawn: Float[Tensor, "*batch 4 g g"], what: Float[Tensor, "*batch Z"]
+    ) -> Float[Tensor, "*batch 4 g g"]:
+        """`forward(what)`, given its values `drawn`, with gradients that keep no activations."""
+        flat = what.reshape(-1, what.shape[-1])
+        before = drawn.reshape(-1, *drawn.shape[-3:])
+        after = redrawn(lambda part: self._decode(part, False), self, self._each(flat), before, flat)
+        return after.reshape(drawn.shape)
+
+    def _each(self, flat: Float[Tensor, "N Z"]) -> int:
+        return part_size(len(flat), 16 * self.size**2, flat)
 
     def _decode(self, what: Float[Tensor, "N Z"], alpha_only: bool) -> Float[Tensor, "N C g g"]:
         features = self.trunk(what[..., None, None])

@@ -19,6 +19,7 @@ from apex_lab.models.scalor.windows import SizeRule, propagated
 from apex_lab.nn.blocks import mlp
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.precision import full
+from apex_lab.nn.slots import leading, padded
 from apex_lab.nn.spatial_transformer import crop, window_of
 
 PRESENT_AT_FIRST = 2.0
@@ -122,7 +123,9 @@ class Propagation(nn.Module):
         raw = sampler.gaussian(q_where)
         where = propagated(raw, before.where, self.size)
 
-        q_what = self._appearance(recompute(encoder, image, window_of(where)), tracker, code)
+        looked_at = window_of(where)[:, : leading(valid)]
+        glimpse = padded(recompute(encoder, image, looked_at), valid.shape[1])
+        q_what = self._appearance(glimpse, tracker, code)
         what = sampler.gaussian(q_what)
         q_depth = gaussian_of(self.depth(torch.cat([tracker, what, code], dim=-1)))
         depth = sampler.gaussian(q_depth)

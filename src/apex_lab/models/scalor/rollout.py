@@ -19,7 +19,7 @@ from apex_lab.models.scalor.slots import FIRST_ID, Objects, Slots, admitted, car
 from apex_lab.models.scalor.windows import SizeRule
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.precision import full
-from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.slots import gather_slots, leading, padded
 from apex_lab.nn.spatial_transformer import window_of
 from apex_lab.scene import ABSENT, Noise, Schedule
 
@@ -170,11 +170,13 @@ class ObjectNetworks(nn.Module):
             slots.objects, slots.valid, feature, image, self.glimpse_encoder, sampler, self.recompute_looks
         )
         objects = propagated.objects
-        drawn = self._drawn(objects.what)
+        some = leading(slots.valid)
+        drawn = self._drawn(objects.what[:, :some])
         with torch.no_grad(), full_precision(image):
-            masks = full(drawn[:, :, -1]) * objects.presence[..., None]
-            explained = paster_of(window_of(objects.where), masks.shape[-1], self.image_size).total(masks)
-        return propagated, drawn, explained
+            masks = full(drawn[:, :, -1]) * objects.presence[:, :some, :, None]
+            windows = window_of(objects.where[:, :some])
+            explained = paster_of(windows, masks.shape[-1], self.image_size).total(masks)
+        return propagated, padded(drawn, slots.valid.shape[1]), explained
 
     def _propose(
         self, image: Tensor, feature: Tensor, explained: Tensor | None, sampler: Sampler
@@ -189,8 +191,8 @@ class ObjectNetworks(nn.Module):
         return proposals, drawn, self.rejection.kept(drawn[:, :, -1], windows, mask)
 
     def _drawn(self, what: Float[Tensor, "B K Z"]) -> Float[Tensor, "B K C g g"]:
-        """Masks for the decisions of the loop, which have no gradient; where there is none at all, colours too."""
-        alpha_only = torch.is_grad_enabled()
+        """Masks for the decisions of the loop, which have no gradient; colours too if these drawings are rendered."""
+        alpha_only = torch.is_grad_enabled() and not self.recompute.draws_twice(what)
         with torch.no_grad():
             return self.glimpse_decoder(what, alpha_only)
 
@@ -221,26 +223,35 @@ class ObjectNetworks(nn.Module):
         sees to that), so only these are drawn with gradients.
         """
         values = torch.stack([_rendered(step) for step in steps], dim=1)
-        slots = steps[0].alive.shape[1]
+        slots, count = steps[0].alive.shape[1], values.shape[2]
         full = steps[0].drawn_found.shape[2] > 1
-        index = torch.arange(values.shape[2], device=values.device).expand(values.shape[:3])
-        if self.training and not full:
+        drawn = [joined_candidates(step, step.drawn, step.drawn_found) if full else None for step in steps]
+        index = torch.arange(count, device=values.device).expand(values.shape[:3])
+        most = [count] * len(steps)
+        if self.training and torch.is_grad_enabled():
             present = values[..., 0].detach().flatten(0, 1) > 0
-            index, valid = (
-                x.unflatten(0, values.shape[:2]) for x in pack(present, min(self.max_objects, values.shape[2]))
-            )
+            index, valid = (x.unflatten(0, values.shape[:2]) for x in pack(present, min(self.max_objects, count)))
             presence, others = gather_slots(values, index, dim=2).split([1, values.shape[-1] - 1], dim=-1)
             values = torch.cat([presence * valid[..., None], others], dim=-1)
+            drawn = [x if x is None else gather_slots(x, at) for x, at in zip(drawn, index.unbind(1), strict=True)]
+            most = [leading(frame) for frame in valid.unbind(1)]
         curriculum = (schedule["alpha_curriculum"] > 0.5) & (index >= slots)
         counted = torch.where(curriculum, 0.0, 1.0)
-        drawn = [joined_candidates(step, step.drawn, step.drawn_found) if full else None for step in steps]
         frames = [
-            self.recompute(self._layers, picture, *inputs)
-            for picture, *inputs in zip(drawn, values.unbind(1), counted.unbind(1), strict=True)
+            self._frame(n, *inputs) for n, *inputs in zip(most, drawn, values.unbind(1), counted.unbind(1), strict=True)
         ]
         layers = Layers(*(torch.stack(sums, dim=1) for sums in zip(*frames, strict=True)))
         every = torch.where(schedule["alpha_curriculum"] > 0.5, CURRICULUM_ALPHA * steps[0].found.shape[1], 0.0)
         return layers._replace(alpha=layers.alpha + every)
+
+    def _frame(self, n: int, drawn: Tensor | None, values: Tensor, counted: Tensor) -> Layers:
+        """The leading `n` candidates of a frame."""
+        values, counted = values[:, :n], counted[:, :n]
+        if drawn is not None:
+            drawn = drawn[:, :n]
+            if torch.is_grad_enabled():
+                drawn = self.glimpse_decoder.again(drawn, values[..., -self.what :])
+        return self.recompute(self._layers, drawn, values, counted)
 
     def _layers(self, drawn: Tensor | None, values: Tensor, counted: Tensor) -> Layers:
         presence, depth, where, what = values.split([1, 1, 4, self.what], dim=-1)
