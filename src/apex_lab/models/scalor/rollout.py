@@ -238,7 +238,8 @@ class ObjectNetworks(nn.Module):
         curriculum = (schedule["alpha_curriculum"] > 0.5) & (index >= slots)
         counted = torch.where(curriculum, 0.0, 1.0)
         frames = [
-            self._frame(n, *inputs) for n, *inputs in zip(most, drawn, values.unbind(1), counted.unbind(1), strict=True)
+            self._frame(n, picture, some, weights)
+            for n, picture, some, weights in zip(most, drawn, values.unbind(1), counted.unbind(1), strict=True)
         ]
         layers = Layers(*(torch.stack(sums, dim=1) for sums in zip(*frames, strict=True)))
         every = torch.where(schedule["alpha_curriculum"] > 0.5, CURRICULUM_ALPHA * steps[0].found.shape[1], 0.0)
