@@ -52,7 +52,9 @@ class _Spread(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None, None]:  # type: ignore[override]
         (classes,) = ctx.saved_tensors
-        return torch.bmm(classes.expand(len(gradient), -1, -1), gradient), gradient.sum(0), None, None
+        kind = gradient.dtype  # bfloat16 under autocast
+        by_class = torch.bmm(classes.to(kind).expand(len(gradient), -1, -1), gradient)
+        return by_class, gradient.sum(0), None, None
 
 
 class TiledWeights(NamedTuple):

@@ -38,7 +38,8 @@ class BroadcastDecoder(nn.Module):
 
     def forward(self, latent: Float[Tensor, "m latent"]) -> Float[Tensor, "m 3 H W"]:
         by_latent, by_place = self._first(latent)
-        if self.training and latent.device.type == "cpu" and not (_half(latent) or torch.compiler.is_compiling()):
+        trains = all(module.training for module in self.modules())  # BatchNorm may be frozen by itself
+        if trains and latent.device.type == "cpu" and not (_half(latent) or torch.compiler.is_compiling()):
             return torch.sigmoid(self._drawn(by_latent, by_place))
         return torch.sigmoid(self.head(self.others(F.elu_(by_latent[..., None, None] + cpu_layout(by_place)))))
 
