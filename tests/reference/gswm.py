@@ -14,7 +14,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import torch
 import torch.nn.functional as F
@@ -82,6 +82,34 @@ class Block(nn.Module):
         return F.relu(y + (x if self.down is None else self.down(x)))
 
 
+def encoder(source: Any) -> nn.Sequential:
+    """Strided convolutions, each with CELU and GroupNorm, and a linear layer (sections 2 and 3)."""
+    layers: list[nn.Module] = []
+    for layer in source.convs:
+        if isinstance(layer, nn.Conv2d):
+            layers.append(nn.Conv2d(layer.in_channels, layer.out_channels, layer.kernel_size, 2, layer.padding))
+        elif isinstance(layer, nn.GroupNorm):
+            layers += [nn.CELU(), nn.GroupNorm(layer.num_groups, layer.num_channels)]
+    head = nn.Linear(source.head.in_features, source.head.out_features)
+    return cast(nn.Sequential, copied(nn.Sequential(*layers, nn.Flatten(), head), source))
+
+
+def decoder(source: Any, activation: bool) -> nn.Sequential:
+    """A linear layer and sub-pixel convolutions, with CELU and GroupNorm between them and a sigmoid at the end."""
+    convs = [layer for layer in source.convs if isinstance(layer, nn.Conv2d)]
+    norms = [layer for layer in source.convs if isinstance(layer, nn.GroupNorm)]
+    stem, first = source.stem, convs[0].in_channels
+    side = math.isqrt(stem.out_features // first)
+    layers: list[nn.Module] = [nn.Linear(stem.in_features, stem.out_features)]
+    layers += [nn.CELU()] if activation else []
+    layers.append(nn.Unflatten(1, (first, side, side)))
+    for i, conv in enumerate(convs):
+        layers += [nn.Conv2d(conv.in_channels, conv.out_channels, 3, padding=1), nn.PixelShuffle(2)]
+        if i < len(norms):
+            layers += [nn.CELU(), nn.GroupNorm(norms[i].num_groups, norms[i].num_channels)]
+    return cast(nn.Sequential, copied(nn.Sequential(*layers, nn.Sigmoid()), source))
+
+
 class Chain(nn.Module):
     """Interaction and LSTM of the posterior (chain 0) or the prior (chain 1)."""
 
@@ -140,20 +168,20 @@ class Naive(nn.Module):
         self.motion, self.environment = model.propagation.motion, model.history.environment
         assert model.background is not None
         bg = model.background
-        self.bg_encoder, self.bg_decoder = copy.deepcopy(bg.encoder), copy.deepcopy(bg.decoder)
+        self.bg_encoder, self.bg_decoder = encoder(bg.encoder), decoder(bg.decoder, activation=False)
         self.bg_q, self.bg_p = copy.deepcopy(bg.q_net), copy.deepcopy(bg.p_net)
         self.bg_q_cell = copy.deepcopy(bg.q_cell)
         self.bg_p_cell = copied(nn.LSTMCell(bg.latent, bg.start.shape[1]), bg.p_lstm)
         self.bg_start = nn.Parameter(bg.start.detach().clone())
-        encoder = model.image_encoder
-        conv = nn.Conv2d(6, encoder.conv.out_channels, 7, 2, 3, bias=False)
-        stages = [Block(block) for block in encoder.stages]
+        images = model.image_encoder
+        conv = nn.Conv2d(6, images.conv.out_channels, 7, 2, 3, bias=False)
+        stages = [Block(block) for block in images.stages]
         self.resnet = nn.Sequential(
-            copied(conv, encoder.conv),
-            copied(nn.BatchNorm2d(encoder.conv.out_channels), encoder.norm),
+            copied(conv, images.conv),
+            copied(nn.BatchNorm2d(images.conv.out_channels), images.norm),
             nn.ReLU(),
             *stages,
-            copy.deepcopy(encoder.head),
+            copy.deepcopy(images.head),
         )
         discovery, propagation = model.discovery, model.propagation
         self.map_net = copy.deepcopy(discovery.map_net)
@@ -161,12 +189,12 @@ class Naive(nn.Module):
             copy.deepcopy(discovery.attribute_head),
             copy.deepcopy(discovery.dyna_head),
         )
-        self.grow, self.encoder = copy.deepcopy(propagation.grow_net), copy.deepcopy(propagation.encoder)
+        self.grow, self.encoder = copy.deepcopy(propagation.grow_net), encoder(propagation.encoder)
         self.q_dyna, self.p_dyna = copy.deepcopy(propagation.q_net), copy.deepcopy(propagation.p_net)
         self.change = copy.deepcopy(propagation.change_net)
-        self.decoder = copy.deepcopy(model.renderer.decoder)
+        self.decoder = decoder(model.renderer.decoder, activation=True)
         if self.environment != "none":
-            self.env = copy.deepcopy(model.history.encoder)
+            self.env = encoder(model.history.encoder)
         self.q_chain, self.p_chain = Chain(model.history, 0), Chain(model.history, 1)
         steps = torch.arange(self.grid) + 0.5
         y, x = torch.meshgrid(steps, steps, indexing="ij")

@@ -120,6 +120,21 @@ class Discovering(NamedTuple):
     frames: Int[Tensor, "B N"] | None
 
 
+def needed_frames(which: Discovering) -> Int[Tensor, "B N"] | None:
+    """The frames whose features are needed; None: all are.
+
+    As published, a frame in which no video of the batch discovers is not encoded, nor does batch normalisation see it.
+    A GPU would have to wait for that number, and a CUDA graph or a compiler takes one shape only, so there all are.
+    """
+    if which.frames is not None or which.mask is None:
+        return which.frames
+    if which.mask.device.type != "cpu" or torch.compiler.is_compiling():
+        return None
+    needed = which.mask.any(0)
+    needed[0] = True  # an encoder of no image would have no gradient
+    return None if bool(needed.all()) else needed.nonzero().T.expand(len(which.mask), -1)
+
+
 def discovering(uniform: Float[Tensor, "B T 2"], dropout: float, how: Draw, first: bool) -> Discovering:
     """Draws the frames of training in which discovery runs. A video's first frame always discovers.
 

@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from apex_lab.models.gswm.background import Backdrop, Background, BackgroundState
-from apex_lab.models.gswm.discovery import Discovering, Discovery, Draw, Posterior, discovering
+from apex_lab.models.gswm.discovery import Discovering, Discovery, Draw, Posterior, discovering, needed_frames
 from apex_lab.models.gswm.history import Environment, Fused, History, Memory
 from apex_lab.models.gswm.image_encoder import ImageEncoder
 from apex_lab.models.gswm.latents import DEPTH, WHERE, Attributes, Draws, Latents, attributes, draw
@@ -208,9 +208,10 @@ class Gswm(SceneModel):
     def _features(self, video: Tensor, backdrops: Tensor, which: Discovering) -> Float[Tensor, "B T F G G"]:
         """Features of the frames that need them, zeros for the others. Gradients reach the background."""
         images = torch.cat([video, video - backdrops], dim=2)
-        if which.frames is None:
+        frames = which.frames if self.image_encoder.kind == "clip" else needed_frames(which)
+        if frames is None:
             return self.image_encoder(images)
-        index = which.frames[..., None, None, None]
+        index = frames[..., None, None, None]
         features = self.image_encoder(images.gather(1, index.expand(-1, -1, *images.shape[2:])))
         whole = features.new_zeros(*video.shape[:2], *features.shape[2:])
         return whole.scatter(1, index.expand(-1, -1, *features.shape[2:]), features)

@@ -78,7 +78,7 @@ class Encoder(nn.Module):
         if images.shape[-1] > SMALL:
             images = for_convolutions(images)
         parts = images.split(part_size(len(images), self._largest, images))
-        return joined(self.head(self.convs(part).flatten(1)) for part in parts)
+        return self.head(joined(self.convs(part).flatten(1) for part in parts))  # one gradient of the large weights
 
 
 class Decoder(nn.Module):
@@ -111,8 +111,8 @@ class Decoder(nn.Module):
         self._largest = max(widths[-1], 4 * outputs) * (size // 2) ** 2
 
     def forward(self, codes: Float[Tensor, "N latent"]) -> Float[Tensor, "N outputs size size"]:
-        parts = codes.split(part_size(len(codes), self._largest, codes))
-        return joined(self.convs(self.shape(self.stem(part))) for part in parts)
+        parts = self.stem(codes).split(part_size(len(codes), self._largest, codes))
+        return joined(self.convs(self.shape(part)) for part in parts)
 
 
 def cell_head(inputs: int, hidden: int, outputs: int) -> nn.Sequential:

@@ -97,23 +97,23 @@ class Renderer(nn.Module):
         Args:
             fixed_alpha: above 0, it takes the place of the decoded masks.
         """
-        m = objects.what.shape[1]
-        size = part_size(len(backdrop), 4 * m * self.image_size**2, backdrop)
-        split = (Attributes(*part) for part in zip(*(x.split(size) for x in objects), strict=True))
-        behind = backdrop.split(size)
-        parts = [self._part(part, some, detail, fixed_alpha) for part, some in zip(split, behind, strict=True)]
-        masks, reconstruction, means = zip(*parts, strict=True)
-        return Drawn(joined(masks), joined(reconstruction), joined(means) if detail else None)
-
-    def _part(self, objects: Attributes, backdrop: Tensor, detail: bool, fixed_alpha: Tensor | None) -> Drawn:
         glimpses = full(self.decoder(objects.what.flatten(0, 1))).unflatten(0, objects.what.shape[:2])
         colour, alpha = glimpses.split([3, 1], dim=2)
         if fixed_alpha is not None:
             alpha = torch.where(fixed_alpha > 0, fixed_alpha, alpha)
         alpha = alpha * objects.pres[..., None, None]
-        paster = Paster(paste_window(objects.where), self.glimpse, self.image_size)
-        pasted = paster.each(torch.cat([alpha * colour, alpha], dim=2))
-        foreground, masks = compose(pasted, torch.sigmoid(-objects.depth[..., 0]))
+        nearness, windows = torch.sigmoid(-objects.depth[..., 0]), paste_window(objects.where)
+        masked = torch.cat([alpha * colour, alpha], dim=2)
+        size = part_size(len(backdrop), masked.shape[1] * 4 * self.image_size**2, backdrop)
+        inputs = zip(*(x.split(size) for x in (masked, colour, nearness, windows, backdrop)), strict=True)
+        masks, reconstruction, means = zip(*(self._composed(*part, detail) for part in inputs), strict=True)
+        return Drawn(joined(masks), joined(reconstruction), joined(means) if detail else None)
+
+    def _composed(
+        self, masked: Tensor, colour: Tensor, nearness: Tensor, windows: Tensor, backdrop: Tensor, detail: bool
+    ) -> Drawn:
+        paster = Paster(windows, self.glimpse, self.image_size)
+        foreground, masks = compose(paster.each(masked), nearness)
         reconstruction = foreground + (1 - masks.sum(1, keepdim=True)) * backdrop
         return Drawn(masks, reconstruction, paster.each(colour) if detail else None)
 
