@@ -392,11 +392,10 @@ class Naive(nn.Module):
         b, t = video.shape[:2]
         sched, cells, each = context.schedule, self.grid**2, self.q_dyna[-1].out_features // 2 + 5 + self.what
         ctx = self.bg_q[-1].out_features // 2
-        normal, uniform = [], []
-        for i in range(t):
-            source = context.noise.at(i)
-            normal.append(source.normal(torch.empty(b, ctx + (cells + self.m) * each)))
-            uniform.append(source.uniform(torch.empty(b, cells + self.m + 2)))
+        # in the model's order, so that both see the same numbers (and discover in the same frames) in training too
+        source = context.noise.at(0, t)
+        normal = list(source.normal(torch.empty(b * t, ctx + (cells + self.m) * each)).view(b, t, -1).unbind(1))
+        uniform = list(source.uniform(torch.empty(b * t, cells + self.m + 2)).view(b, t, -1).unbind(1))
         discovers = self.who_discovers(uniform)
         h_q, c_q, h_p, c_p = (start.expand(b, -1) for start in self.bg_start)
         terms: dict[str, Any] = {}
