@@ -10,6 +10,8 @@ from torch import Tensor, nn
 
 from apex_lab.models.gswm import Gswm
 from apex_lab.models.gswm.history import Environment
+from apex_lab.nn.noise import RankNoise
+from apex_lab.scene import Context
 from tests.models.gswm.small import context, double, loss, tiny, video
 from tests.reference.gswm import Naive
 
@@ -91,6 +93,39 @@ def test_other_draws_of_the_frames_that_discover(draw: Any) -> None:
     for name in model.term_names:
         torch.testing.assert_close(scene.terms[name], expected[name], rtol=1e-8, atol=1e-8)
     assert torch.equal(scene.ids[:, :, :-1], expected["ids"])
+
+
+@pytest.mark.parametrize("draw", ["independent", "batch"])
+def test_frames_in_which_no_video_discovers(draw: Any) -> None:
+    """They are not encoded, as published: neither the terms nor batch normalisation's statistics have them."""
+    model = tiny(discovery_dropout=0.8, discovery_draw=draw)
+    scene, expected, twin = both(model, True)
+    ours, theirs = model.image_encoder.norm, twin.resnet[1]
+    assert isinstance(ours, nn.BatchNorm2d)
+    assert isinstance(theirs, nn.BatchNorm2d)
+    assert 1 <= int(ours.num_batches_tracked) < 5  # of the video's 5 frames
+    assert ours.num_batches_tracked == theirs.num_batches_tracked
+    torch.testing.assert_close(ours.running_mean, theirs.running_mean)
+    torch.testing.assert_close(ours.running_var, theirs.running_var)
+    for name in model.term_names:
+        torch.testing.assert_close(scene.terms[name], expected[name], rtol=1e-8, atol=1e-8)
+    loss(scene.terms).backward()
+    loss({name: expected[name] for name in model.term_names}).backward()
+    for a, b in zip(model.image_encoder.conv.parameters(), twin.resnet[0].parameters(), strict=True):
+        torch.testing.assert_close(a.grad, b.grad, rtol=1e-6, atol=1e-6 * b.grad.abs().max().item())
+
+
+def test_training_noise() -> None:
+    """In training, numbers come from one generator: the twin draws them in the model's order."""
+    model = tiny()
+    twin = Naive(model)
+    x, schedule = video(), context().schedule
+    found = []
+    for net in (model, twin):
+        torch.manual_seed(0)
+        found.append(net.train()(x, Context(schedule, RankNoise(len(x), 0, len(x)))))
+    for name in model.term_names:
+        torch.testing.assert_close(found[0].terms[name], found[1][name], rtol=1e-8, atol=1e-8)
 
 
 def test_running_statistics() -> None:

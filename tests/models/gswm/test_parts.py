@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from unittest import mock
 
 import pytest
 import torch
 from torch import nn
 
-from apex_lab.models.gswm.discovery import Discovery, discovering
+from apex_lab.models.gswm.discovery import Discovering, Discovery, discovering, needed_frames
 from apex_lab.models.gswm.history import Interaction
 from apex_lab.models.gswm.image_encoder import ImageEncoder
 from apex_lab.models.gswm.latents import Attributes, attributes, draw, gaussian, kl_bernoulli, relaxed_bernoulli
@@ -341,6 +342,26 @@ def test_one_draw_for_the_whole_batch() -> None:
     assert float(which.mask[0].float().mean()) == pytest.approx(0.7, abs=0.05)
     assert tiny(norm="group", discovery_draw="batch").batch_statistics
     assert not tiny(norm="group").batch_statistics
+
+
+def test_only_frames_in_which_a_video_discovers_are_needed() -> None:
+    mask = torch.tensor([[True, False, True, False], [True, False, False, False]])
+    needed = needed_frames(Discovering(mask, None))
+    assert needed is not None
+    assert needed.tolist() == [[0, 2], [0, 2]]
+    none = needed_frames(Discovering(torch.zeros_like(mask), None))
+    assert none is not None
+    assert none.tolist() == [[0], [0]]
+    assert needed_frames(Discovering(torch.ones_like(mask), None)) is None
+    assert needed_frames(Discovering(None, None)) is None
+
+
+def test_statistics_of_a_clip_are_of_all_its_frames() -> None:
+    """With `clip`, a frame in which no video discovers still counts: on every device the same."""
+    model = tiny(norm="clip", discovery_dropout=1.0).train()
+    with mock.patch.object(model.image_encoder, "forward", wraps=model.image_encoder.forward) as encoder:
+        model(video(), context())
+    assert encoder.call_args.args[0].shape[:2] == (3, 5)
 
 
 @pytest.mark.parametrize("how", ["independent", "balanced", "batch"])
