@@ -105,8 +105,9 @@ class Renderer(nn.Module):
         nearness, windows = torch.sigmoid(-objects.depth[..., 0]), paste_window(objects.where)
         masked = torch.cat([alpha * colour, alpha], dim=2)
         size = part_size(len(backdrop), masked.shape[1] * 4 * self.image_size**2, backdrop)
-        inputs = zip(*(x.split(size) for x in (masked, colour, nearness, windows, backdrop)), strict=True)
-        masks, reconstruction, means = zip(*(self._composed(*part, detail) for part in inputs), strict=True)
+        parts = [x.split(size) for x in (masked, colour, nearness, windows, backdrop)]
+        composed = [self._composed(a, c, n, w, b, detail) for a, c, n, w, b in zip(*parts, strict=True)]
+        masks, reconstruction, means = zip(*composed, strict=True)
         return Drawn(joined(masks), joined(reconstruction), joined(means) if detail else None)
 
     def _composed(
