@@ -7,7 +7,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from apex_lab.nn.celu_norm import CeluGroupNorm, elu
+from apex_lab.nn.celu_norm import CeluGroupNorm
+from apex_lab.nn.rows import elu
 
 
 def pair(channels: int, groups: int, dtype: torch.dtype) -> tuple[CeluGroupNorm, nn.GroupNorm]:

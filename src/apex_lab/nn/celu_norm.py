@@ -1,13 +1,11 @@
 """CELU and then GroupNorm, the order of SPACE's and SCALOR's blocks, in fewer passes over memory on a CPU.
 
-PyTorch's ELU and CELU take 0.9 ns for a value there, most of it for `expm1`; `exp2` takes a quarter of that. Its
-GroupNorm of channels-last images, the layout in which convolutions are fast, takes up to four times as long for few
-channels as for images whose channels are planes.
+PyTorch's CELU computes `expm1`, which is slow there (`nn/rows.py`). Its GroupNorm of channels-last images, the layout in
+which convolutions are fast, takes up to four times as long for few channels as for images whose channels are planes.
 """
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import torch
@@ -15,6 +13,8 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
+
+from apex_lab.nn.rows import along_rows, elu, images_of, rows_of, sums, through_elu
 
 FEW = 32
 """Up to so many channels, the written-out norm of channels-last images is faster than PyTorch's."""
@@ -39,17 +39,6 @@ def celu_group_norm(
     if plain and x.numel() > 0:
         return _CeluGroupNorm.apply(x, groups, weight, bias, eps)
     return F.group_norm(F.celu_(x), groups, weight, bias, eps)
-
-
-def elu(x: Tensor) -> Tensor:
-    """ELU, alpha 1, without gradient: a new tensor, exact to the rounding of values near 1."""
-    below = torch.clamp_max(x, 0).mul_(math.log2(math.e)).exp2_().sub_(1)
-    return torch.maximum(x, below, out=below)  # exp(x) - 1 >= x, with equality at 0
-
-
-def through_elu(gradient: Tensor, after: Tensor) -> Tensor:
-    """Gradient with respect to an ELU's input, written into the one with respect to its output `after`."""
-    return torch.ops.aten.elu_backward.grad_input(gradient, 1, 1, 1, True, after, grad_input=gradient)
 
 
 class _CeluGroupNorm(torch.autograd.Function):
@@ -91,43 +80,30 @@ def _sizes(y: Tensor) -> tuple[int, int, int]:
 
 def _norm(y: Tensor, groups: int, weight: Tensor, bias: Tensor, eps: float) -> tuple[Tensor, Tensor, Tensor]:
     """GroupNorm of channels-last values; mean and 1 / std are (n, groups)."""
-    rows, number = _rows(y), y[0].numel() // groups
+    rows, number = rows_of(y), y[0].numel() // groups
     mean = y.sum((2, 3)).unflatten(1, (groups, -1)).sum(2) / number
     work = (rows - _each(_channels(mean, y), y)).square_()
-    inverse = torch.rsqrt(_sums(work, y).unflatten(1, (groups, -1)).sum(2) / number + eps)
+    inverse = torch.rsqrt(sums(work, y.shape[1]).unflatten(1, (groups, -1)).sum(2) / number + eps)
     gain = _channels(inverse, y) * weight
     torch.addcmul(_each(bias - _channels(mean, y) * gain, y), rows, _each(gain, y), out=work)
-    return _images(work, y), mean, inverse
+    return images_of(work, y.shape[1]), mean, inverse
 
 
 def _norm_backward(
     gradient: Tensor, y: Tensor, mean: Tensor, inverse: Tensor, weight: Tensor, groups: int
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients with respect to y, weight and bias."""
-    rows, number = _rows(y), y[0].numel() // groups
-    given = _rows(gradient)
+    rows, number = rows_of(y), y[0].numel() // groups
+    given = rows_of(gradient)
     work = given * rows
-    product, plain = _sums(work, y), gradient.sum((2, 3))  # (n, C)
+    product, plain = sums(work, y.shape[1]), gradient.sum((2, 3))  # (n, C)
     of_group = [(part * weight).unflatten(1, (groups, -1)).sum(2) for part in (product, plain)]
     slope = (of_group[1] * mean - of_group[0]) * inverse**3 / number
     still = -slope * mean - of_group[1] * inverse / number
     torch.addcmul(_each(_channels(still, y), y), rows, _each(_channels(slope, y), y), out=work)
     work.addcmul_(given, _each(_channels(inverse, y) * weight, y))
     to_weight = ((product - plain * _channels(mean, y)) * _channels(inverse, y)).sum(0)
-    return _images(work, y), to_weight, plain.sum(0)
-
-
-def _rows(y: Float[Tensor, "n C h w"]) -> Float[Tensor, "n h wC"]:
-    """A view of channels-last images: the values of an image row are one run of memory."""
-    return y.permute(0, 2, 3, 1).flatten(2)
-
-
-def _images(rows: Float[Tensor, "n h wC"], like: Tensor) -> Float[Tensor, "n C h w"]:
-    return rows.unflatten(2, (-1, like.shape[1])).permute(0, 3, 1, 2)
-
-
-def _sums(rows: Float[Tensor, "n h wC"], like: Tensor) -> Float[Tensor, "n C"]:
-    return _images(rows, like).sum((2, 3))
+    return images_of(work, y.shape[1]), to_weight, plain.sum(0)
 
 
 def _channels(of_groups: Float[Tensor, "n groups"], like: Tensor) -> Float[Tensor, "n C"]:
@@ -135,5 +111,4 @@ def _channels(of_groups: Float[Tensor, "n groups"], like: Tensor) -> Float[Tenso
 
 
 def _each(of_channels: Float[Tensor, "n C"], like: Tensor) -> Float[Tensor, "n 1 wC"]:
-    """Repeated along an image row, so that a product with rows runs over long stretches of memory."""
-    return of_channels[:, None].expand(-1, like.shape[3], -1).flatten(1)[:, None]
+    return along_rows(of_channels, like.shape[3])

@@ -16,7 +16,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from apex_lab.nn.celu_norm import CeluGroupNorm
 from apex_lab.nn.splitting import joined, part_size
+from apex_lab.nn.subpixel import SubPixelConv
 
 PUBLISHED_SIZE = 128
 """Side in pixels of the images that SPACE was published for."""
@@ -25,7 +27,7 @@ PUBLISHED_SIZE = 128
 def conv_celu(inputs: int, outputs: int, kernel: int, stride: int, padding: int, groups: int) -> nn.Sequential:
     """Convolution, CELU, GroupNorm: the order of the published code."""
     conv = nn.Conv2d(inputs, outputs, kernel, stride, padding)
-    return nn.Sequential(conv, nn.CELU(inplace=True), nn.GroupNorm(groups, outputs))
+    return nn.Sequential(conv, nn.Identity(), CeluGroupNorm(groups, outputs))  # Identity: as parameters are named
 
 
 def conv_elu(inputs: int, outputs: int, stride: int, padding: int) -> nn.Sequential:
@@ -95,12 +97,21 @@ def cpu_layout(x: Tensor) -> Tensor:
 def upsample(inputs: int, outputs: int, factor: int, groups: int) -> nn.Sequential:
     """Sub-pixel stage: 1 x 1 convolution and pixel shuffle by `factor`, then a 3 x 3 convolution, each normalised."""
     return nn.Sequential(
-        nn.Conv2d(inputs, outputs * factor**2, 1),
-        nn.PixelShuffle(factor),
-        nn.CELU(inplace=True),
-        nn.GroupNorm(groups, outputs),
+        SubPixelConv(inputs, outputs, factor),
+        nn.Identity(),  # two: as parameters are named
+        nn.Identity(),
+        CeluGroupNorm(groups, outputs),
         *conv_celu(outputs, outputs, 3, 1, 1, groups),
     )
+
+
+class WholeMap(nn.Conv2d):
+    """A convolution whose kernel covers its whole input: on a CPU a linear layer, which takes 0.4 times as long."""
+
+    def forward(self, x: Float[Tensor, "m C k k"]) -> Float[Tensor, "m outputs 1 1"]:
+        if x.device.type != "cpu":
+            return super().forward(x)
+        return F.linear(x.flatten(1), self.weight.flatten(1), self.bias)[..., None, None]
 
 
 class ImageEncoder(nn.Module):
@@ -138,7 +149,7 @@ class ImageEncoder(nn.Module):
         self.merge = conv_celu(256, 128, 3, 1, 1, groups=16)
 
     def forward(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 128 G G"]:
-        trunk = self.trunk(images)
+        trunk = self.trunk(cpu_layout(images))
         return self.merge(torch.cat([trunk, self.lateral(trunk)], dim=1))
 
 
@@ -159,7 +170,7 @@ class GlimpseEncoder(nn.Module):
             conv_celu(32, 32, 3, 1, 1, groups=4),
             conv_celu(32, 64, 4, 2, 1, groups=8),
             last,
-            conv_celu(128, 256, 4, 1, 0, groups=16),
+            nn.Sequential(WholeMap(128, 256, 4), nn.Identity(), CeluGroupNorm(16, 256)),
             nn.Flatten(),
         )
         self.head = nn.Linear(256, 2 * what)
@@ -167,7 +178,7 @@ class GlimpseEncoder(nn.Module):
 
     def forward(self, crops: Float[Tensor, "m 3 g g"]) -> Float[Tensor, "m two_what"]:
         parts = crops.split(part_size(len(crops), self.largest, crops))
-        return self.head(joined(self.convs(part) for part in parts))
+        return self.head(joined(self.convs(cpu_layout(part)) for part in parts))
 
 
 class GlimpseDecoder(nn.Module):
@@ -242,13 +253,15 @@ class SubpixelDecoder(nn.Module):
             inputs = channels
         self.trunk = nn.Sequential(*layers, conv_celu(inputs, inputs, 3, 1, 1, groups=4))
         self.head = nn.Conv2d(inputs, outputs, 3, padding=1)
-        self.largest = inputs * image_size**2
+        before, last = stages[-2][1], factors[-1]
+        self.small, self.large = before * (image_size // last) ** 2, inputs * image_size**2
 
     def forward(self, latent: Float[Tensor, "m latent"]) -> Float[Tensor, "m outputs H W"]:
-        size = part_size(len(latent), self.largest, latent)
-        return joined(
-            torch.sigmoid(self.head(cpu_layout(self.trunk(part)))) for part in latent[..., None, None].split(size)
-        )
+        # many pictures at once while maps are small, since the weights of these layers are large
+        x = latent[..., None, None]
+        x = joined(self.trunk[:-2](part) for part in x.split(part_size(len(x), self.small, x)))
+        parts = x.split(part_size(len(x), self.large, x))
+        return joined(torch.sigmoid(self.head(cpu_layout(self.trunk[-2:](part)))) for part in parts)
 
 
 def mask_decoder(latent: int, image_size: int) -> SubpixelDecoder:

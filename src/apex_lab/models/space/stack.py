@@ -4,17 +4,22 @@ Its maps are the largest tensors of a training step: 2.2 MB for each of n K pict
 every normalisation and activation would read and write all of them, far more than a processor's cache holds, and wait
 for memory. Image by image, what is read from memory is a convolution's output, once forward and twice backward; the
 rest stays in the cache, and only those outputs are kept for the backward pass.
+
+BatchNorm takes away whatever is the same for all pixels of a channel. So the convolutions leave out their bias, whose
+gradient is zero, and take away the first image's means instead: plain sums of squares then lose nothing to rounding.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+
+from apex_lab.nn.rows import along_rows, elu, images_of, rows_of, sums, through_elu
 
 
 class Statistics(NamedTuple):
@@ -25,17 +30,21 @@ class Statistics(NamedTuple):
     number: int
 
 
-class Scaled(NamedTuple):
-    """A normalisation, each (C, 1, 1): values minus `mean`, times `gain`, plus `shift`; `inverse` is 1 / std."""
+class Scale(NamedTuple):
+    """A layer's normalisation of its convolution's kept outputs, each (C,): their mean, 1 / std, gain and shift."""
 
     mean: Tensor
     inverse: Tensor
     gain: Tensor
     shift: Tensor
 
-    def activated(self, centred: Tensor) -> Tensor:
-        """ELU of the normalised values."""
-        return F.elu_(torch.addcmul(self.shift, centred, self.gain))
+    def activated(self, outputs: Sequence[Float[Tensor, "1 C h w"]]) -> Iterator[Float[Tensor, "1 C h w"]]:
+        """ELU of normalised outputs, image by image."""
+        width, channels = outputs[0].shape[-1], len(self.gain)
+        gain, shift = along_rows(self.gain[None], width), along_rows(self.shift[None], width)
+        scaled, found = (torch.empty_like(rows_of(outputs[0])) for _ in range(2))
+        for y in outputs:
+            yield images_of(elu(torch.addcmul(shift, rows_of(y), gain, out=scaled), found), channels)
 
 
 def draw(
@@ -69,24 +78,19 @@ class _Stack(torch.autograd.Function):
         *weights: Tensor,
     ) -> tuple[Tensor, ...]:
         outputs: list[list[Tensor]] = []
-        scales: list[Scaled] = []
+        scales: list[Scale] = []
         statistics: list[Tensor] = []
+        inputs = _first(by_latent, by_place)
         for i, epsilon in enumerate(epsilons):
             kernel, offset, gain, shift = weights[4 * i : 4 * i + 4]
-            moments = _Moments()
-            made = []
-            for m in range(len(by_latent)):
-                x = _first(by_latent, by_place, m) if i == 0 else scales[-1].activated(outputs[-1][m] - scales[-1].mean)
-                made.append(F.conv2d(x, kernel, offset))
-                moments.add(made[-1])
-            mean, variance = moments.found()
+            made, around, mean, variance = _convolved(inputs, kernel)
             inverse = torch.rsqrt(variance + epsilon)
-            each = (mean, inverse, gain * inverse, shift)
+            gain = gain * inverse
+            scales.append(Scale(mean, inverse, gain, shift - mean * gain))
             outputs.append(made)
-            scales.append(Scaled(*(part[:, None, None] for part in each)))
-            statistics += [mean, variance]
-        pixels = (_pixels(scales[-1].activated(y - scales[-1].mean)) for y in outputs[-1])
-        drawn = torch.stack([torch.addmm(bias, each, head.flatten(1).T).T for each in pixels])
+            statistics += [around + mean + offset, variance]
+            inputs = scales[-1].activated(made)
+        drawn = torch.stack([torch.addmm(bias[:, None], head.flatten(1), _pixels(x).T) for x in inputs])
         flat = [y for made in outputs for y in made]
         ctx.save_for_backward(by_latent, by_place, head, *weights, *(part for scale in scales for part in scale), *flat)
         ctx.layers = len(epsilons)
@@ -98,92 +102,96 @@ class _Stack(torch.autograd.Function):
         saved, n = list(ctx.saved_tensors), ctx.layers
         by_latent, by_place, head = saved[:3]
         weights, saved = saved[3 : 3 + 4 * n], saved[3 + 4 * n :]
-        scales, saved = [Scaled(*saved[4 * i : 4 * i + 4]) for i in range(n)], saved[4 * n :]
+        scales, saved = [Scale(*saved[4 * i : 4 * i + 4]) for i in range(n)], saved[4 * n :]
         count = len(by_latent)
         outputs = [saved[count * i : count * (i + 1)] for i in range(n)]
 
         to_head, to_bias = torch.zeros_like(head), gradient.sum((0, 2, 3))
         passed: list[Tensor] = []  # gradients with respect to a layer's normalised values, of each image
-        sums = _Sums()
-        for m, y in enumerate(outputs[-1]):
-            centred = y - scales[-1].mean
-            x = scales[-1].activated(centred)
+        for m, x in enumerate(scales[-1].activated(outputs[-1])):
             each = gradient[m].flatten(1)  # (outputs, pixels)
             to_head += (each @ _pixels(x)).view_as(head)
             to_x = (each.T @ head.flatten(1)).unflatten(0, x.shape[-2:]).permute(2, 0, 1)[None]
-            passed.append(_through_elu(to_x, x))
-            sums.add(passed[-1], centred)
+            passed.append(through_elu(to_x, x))
 
         to_weights: list[Tensor] = []
         to_latent, to_place = torch.empty_like(by_latent), torch.zeros_like(by_place)
         for i in reversed(range(n)):
-            scale, (kernel, _, _, _) = scales[i], weights[4 * i : 4 * i + 4]
-            still, slope, to_gain, to_shift = sums.found(scale, count * outputs[i][0][0, 0].numel())
-            to_kernel, to_offset = torch.zeros_like(kernel), torch.zeros_like(to_shift)
-            sums = _Sums()
-            for m in range(count):
-                # BatchNorm's gradient: gain (gradient - its mean - normalised value times its product's mean)
-                to_y = torch.addcmul(still, outputs[i][m] - scale.mean, slope).addcmul_(passed[m], scale.gain)
-                centred = None if i == 0 else outputs[i - 1][m] - scales[i - 1].mean
-                x = _first(by_latent, by_place, m) if centred is None else scales[i - 1].activated(centred)
-                to_x, of_kernel, of_offset = torch.ops.aten.convolution_backward(
-                    to_y, x, kernel, [len(kernel)], [1, 1], [0, 0], [1, 1], False, [0, 0], 1, [True] * 3
+            kernel, offset = weights[4 * i : 4 * i + 2]
+            to_outputs, to_gain, to_shift = _through_norm(scales[i], passed, outputs[i])
+            to_kernel = torch.zeros_like(kernel)
+            inputs = scales[i - 1].activated(outputs[i - 1]) if i > 0 else _first(by_latent, by_place)
+            for m, (to_y, x) in enumerate(zip(to_outputs, inputs, strict=True)):
+                to_x, of_kernel, _ = torch.ops.aten.convolution_backward(
+                    to_y, x, kernel, None, [1, 1], [0, 0], [1, 1], False, [0, 0], 1, [True, True, False]
                 )
                 to_kernel += of_kernel
-                to_offset += of_offset
-                passed[m] = _through_elu(to_x, x)
-                if centred is not None:
-                    sums.add(passed[m], centred)
-                else:
+                passed[m] = through_elu(to_x, x)
+                if i == 0:
                     to_latent[m] = passed[m].sum((0, 2, 3))
                     to_place += passed[m]
-            to_weights = [to_kernel, to_offset, to_gain, to_shift, *to_weights]
+            to_weights = [to_kernel, torch.zeros_like(offset), to_gain, to_shift, *to_weights]
         return None, to_latent, to_place, to_head, to_bias, *to_weights
 
 
-class _Moments:
-    """Mean and variance over images that come one by one, by the sums of each around its own mean."""
-
-    def __init__(self) -> None:
-        self.each: list[tuple[Tensor, Tensor]] = []
-
-    def add(self, y: Float[Tensor, "1 C h w"]) -> None:
-        mean = y.mean((0, 2, 3))
-        self.each.append((mean, (y - mean[:, None, None]).square_().mean((0, 2, 3))))
-
-    def found(self) -> tuple[Float[Tensor, " C"], Float[Tensor, " C"]]:
-        means, variances = (torch.stack(part).double() for part in zip(*self.each, strict=True))
-        kind = self.each[0][0].dtype
-        return means.mean(0).to(kind), (variances.mean(0) + means.var(0, unbiased=False)).to(kind)
+def _first(by_latent: Float[Tensor, "m C"], by_place: Float[Tensor, "1 C h w"]) -> Iterator[Float[Tensor, "1 C h w"]]:
+    """What the first convolution here sees, image by image."""
+    place, channels = rows_of(by_place), by_latent.shape[1]
+    added, found = (torch.empty_like(place) for _ in range(2))
+    for each in by_latent:
+        torch.add(place, along_rows(each[None], by_place.shape[-1]), out=added)
+        yield images_of(elu(added, found), channels)
 
 
-class _Sums:
-    """Sums over images that BatchNorm's gradient needs: of the gradient, and of its product with the centred values."""
+def _convolved(
+    inputs: Iterator[Float[Tensor, "1 C h w"]], kernel: Tensor
+) -> tuple[list[Tensor], Tensor, Tensor, Tensor]:
+    """Convolutions minus the means of the first one; those means; and mean and biased variance of what is left."""
+    made: list[Tensor] = []
+    moments: list[Tensor] = []
+    around = kernel.new_zeros(len(kernel))
+    work = torch.empty(0, dtype=kernel.dtype)
+    for x in inputs:
+        y = F.conv2d(x, kernel, -around)
+        if not made:
+            around = y.mean((0, 2, 3))
+            y -= around[:, None, None]
+        made.append(y)
+        work = work if len(work) else torch.empty_like(y)
+        moments.append(torch.stack([y.mean((0, 2, 3)), torch.mul(y, y, out=work).mean((0, 2, 3))]))
+    mean, square = torch.stack(moments).double().mean(0)
+    return made, around, mean.to(kernel.dtype), (square - mean**2).clamp_min(0).to(kernel.dtype)
 
-    def __init__(self) -> None:
-        self.each: list[tuple[Tensor, Tensor]] = []
 
-    def add(self, gradient: Float[Tensor, "1 C h w"], centred: Float[Tensor, "1 C h w"]) -> None:
-        self.each.append((gradient.sum((0, 2, 3)), (gradient * centred).sum((0, 2, 3))))
+def _through_norm(
+    scale: Scale, passed: Sequence[Tensor], outputs: Sequence[Tensor]
+) -> tuple[Iterator[Float[Tensor, "1 C h w"]], Tensor, Tensor]:
+    """Gradients with respect to a layer's normalised values -> to its outputs, image by image, to weight and bias.
 
-    def found(self, scale: Scaled, count: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Constant and slope of what is added to gain times gradient; gradients of BatchNorm's weight and bias."""
-        kind = self.each[0][0].dtype
-        plain, product = (torch.stack(part).double().sum(0).to(kind) for part in zip(*self.each, strict=True))
-        still = -scale.gain * (plain / count)[:, None, None]
-        slope = -scale.gain * scale.inverse.square() * (product / count)[:, None, None]
-        return still, slope, product * scale.inverse.flatten(), plain
+    BatchNorm's gradient is gain (gradient - its mean - normalised value times the mean of their product).
+    """
+    channels, width = len(scale.gain), outputs[0].shape[-1]
+    number = len(outputs) * outputs[0][0, 0].numel()
+    work = torch.empty_like(outputs[0])
+    each = [
+        torch.stack([g.sum((0, 2, 3)), torch.mul(g, y, out=work).sum((0, 2, 3))])
+        for g, y in zip(passed, outputs, strict=True)
+    ]
+    plain, product = torch.stack(each).double().sum(0)
+    product = (product - scale.mean * plain) * scale.inverse
+    slope = -scale.gain * scale.inverse * product / number
+    still = -scale.gain * plain / number - slope * scale.mean
+    kind = scale.gain.dtype
+    rows = [along_rows(part.to(kind)[None], width) for part in (still, slope, scale.gain)]
 
+    def to_outputs() -> Iterator[Tensor]:
+        found = torch.empty_like(rows_of(outputs[0]))
+        for g, y in zip(passed, outputs, strict=True):
+            yield images_of(torch.addcmul(rows[0], rows_of(y), rows[1], out=found).addcmul_(rows_of(g), rows[2]), channels)
 
-def _first(by_latent: Tensor, by_place: Tensor, m: int) -> Float[Tensor, "1 C h w"]:
-    """What the first convolution here sees of image m."""
-    return F.elu_(by_place + by_latent[m, :, None, None])
+    return to_outputs(), product.to(kind), plain.to(kind)
 
 
 def _pixels(x: Float[Tensor, "1 C h w"]) -> Float[Tensor, "pixels C"]:
     """A view of channels-last values."""
     return x.permute(0, 2, 3, 1).flatten(0, 2)
-
-
-def _through_elu(gradient: Tensor, after: Tensor) -> Tensor:
-    return torch.ops.aten.elu_backward(gradient, 1, 1, 1, True, after)  # True: from the ELU's output
