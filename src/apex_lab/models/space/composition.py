@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from apex_lab.nn.precision import full
@@ -22,6 +22,9 @@ STEEPNESS, TOLERANCE = 1000.0, 0.7
 
 IMAGES = 16
 """Images composed at once: bounds the memory of the full-size maps, of which there are four a cell."""
+
+ROWS = 16
+"""Of an image, composed at once where a part is not a whole image: the fewer, the fewer cells reach them."""
 
 LOWEST = -80.0
 """Logits this far below the largest are raised to it: their share is nothing, and numbers that underflow are slow."""
@@ -54,15 +57,15 @@ class _Compose(torch.autograd.Function):
 
         Returns sums over cells (n, 4, H, W) of mask and masked colours, and shares (n, N, H, W).
         """
-        n, cells, channels = glimpses.shape[:3]
+        n, count, channels = glimpses.shape[:3]
         h, w = w_y.shape[-1], w_x.shape[-1]
-        total = glimpses.new_empty(n, channels, h, w)
-        shares = glimpses.new_empty(n, cells, h, w)
-        for images, rows in _strips(n, cells * channels, h, w, glimpses):
-            maps = _pasted(_rows(glimpses[images], w_y[images, ..., rows]), w_x[images])
-            weights = _weights(maps[:, :, 0], strength[images])
+        total = glimpses.new_zeros(n, channels, h, w)
+        shares = glimpses.new_zeros(n, count, h, w)
+        for images, rows, cells in _strips(w_y, channels * w):
+            maps = _pasted(_rows(glimpses[images, cells], w_y[images, cells, :, rows]), w_x[images, cells])
+            weights = _weights(maps[:, :, 0], strength[images, cells], count)
             maps.mul_(weights[:, :, None])
-            shares[images, :, rows] = maps[:, :, 0]
+            shares[images, cells, rows] = maps[:, :, 0]
             total[images, :, rows] = maps.sum(1)
         ctx.save_for_backward(glimpses, strength, w_y, w_x, total)
         ctx.mark_non_differentiable(shares)
@@ -71,36 +74,53 @@ class _Compose(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:  # type: ignore[override]
         glimpses, strength, w_y, w_x, total = ctx.saved_tensors
-        n, cells, channels = glimpses.shape[:3]
-        to_glimpses, to_strength = torch.zeros_like(glimpses), torch.zeros_like(strength)
-        to_w_y, to_w_x = torch.empty_like(w_y), torch.zeros_like(w_x)
+        count, channels = glimpses.shape[1:3]
+        to_glimpses, to_strength, to_w_y, to_w_x = (torch.zeros_like(x) for x in (glimpses, strength, w_y, w_x))
         # the softmax's gradient needs sum_n w_n dL/dw_n, and that is the sum over what the weights gave
         mean_gain = (grad * total).sum(1, keepdim=True)
-        for images, rows in _strips(n, cells * channels, w_y.shape[-1], w_x.shape[-1], glimpses):
-            bent = _rows(glimpses[images], w_y[images, ..., rows])  # (b, N, 4 r, g)
-            maps = _pasted(bent, w_x[images])
-            weights = _weights(maps[:, :, 0], strength[images])
+        for images, rows, cells in _strips(w_y, channels * w_x.shape[-1]):
+            some, some_y, some_x = glimpses[images, cells], w_y[images, cells, :, rows], w_x[images, cells]
+            bent = _rows(some, some_y)  # (b, N, 4 r, g)
+            maps = _pasted(bent, some_x)
+            factor = strength[images, cells]
+            weights = _weights(maps[:, :, 0], factor, count)
             strip = grad[images, None, :, rows]
             to_logit = (maps * strip).sum(2).sub_(mean_gain[images, :, rows]).mul_(weights)
-            to_strength[images] += (to_logit * maps[:, :, 0]).sum((-2, -1))
+            to_strength[images, cells] += (to_logit * maps[:, :, 0]).sum((-2, -1))
             to_maps = torch.mul(strip, weights[:, :, None], out=maps)
-            to_maps[:, :, 0].addcmul_(to_logit, strength[images][..., None, None])
+            to_maps[:, :, 0].addcmul_(to_logit, factor[..., None, None])
             flat = to_maps.flatten(2, 3)  # (b, N, 4 r, W)
-            to_w_x[images] += bent.transpose(-1, -2) @ flat
-            to_bent = (flat @ w_x[images].transpose(-1, -2)).unflatten(2, (channels, -1))  # (b, N, 4, r, g)
+            to_w_x[images, cells] += bent.transpose(-1, -2) @ flat
+            to_bent = (flat @ some_x.transpose(-1, -2)).unflatten(2, (channels, -1))  # (b, N, 4, r, g)
             to_bent = to_bent.transpose(2, 3).flatten(3)  # (b, N, r, 4 g)
-            to_glimpses[images] += (w_y[images, ..., rows] @ to_bent).unflatten(-1, (channels, -1)).transpose(2, 3)
-            to_w_y[images, ..., rows] = _side_by_side(glimpses[images]) @ to_bent.transpose(-1, -2)
+            to_glimpses[images, cells] += (some_y @ to_bent).unflatten(-1, (channels, -1)).transpose(2, 3)
+            to_w_y[images, cells, :, rows] = _side_by_side(some) @ to_bent.transpose(-1, -2)
         return to_glimpses, to_strength, to_w_y, to_w_x
 
 
-def _strips(n: int, maps: int, height: int, width: int, like: Tensor) -> Iterator[tuple[slice, slice]]:
-    """Parts (images, rows) of n images with `maps` full-size maps each."""
-    images = min(IMAGES, part_size(n, maps * height * width, like))
-    rows = part_size(height, maps * width, like)
+def _strips(
+    w_y: Float[Tensor, "n N g H"], values_each: int
+) -> Iterator[tuple[slice, slice, slice | Int[Tensor, " active"]]]:
+    """Parts (images, rows, cells) of n images whose rows have `values_each` numbers in the maps of a cell.
+
+    On a CPU a part is a few rows of an image, and has only those cells whose windows reach them: the others draw
+    nothing there, and no gradient comes back to them.
+    """
+    n, count, _, height = w_y.shape
+    images = min(IMAGES, part_size(n, count * height * values_each, w_y))
+    rows = part_size(height, count * values_each, w_y)
+    if n > images == 1 or rows < height:
+        rows = min(rows, ROWS)
+    reached = w_y.sum(2) > 0 if rows < height else None
     for i in range(0, n, images):
         for y in range(0, height, rows):
-            yield slice(i, min(i + images, n)), slice(y, min(y + rows, height))
+            strip = slice(y, min(y + rows, height))
+            if reached is None:
+                yield slice(i, min(i + images, n)), strip, slice(None)
+                continue
+            active = reached[i, :, strip].any(1).nonzero().squeeze(1)
+            if len(active):
+                yield slice(i, i + 1), strip, active
 
 
 def _side_by_side(glimpses: Tensor) -> Tensor:
@@ -119,11 +139,18 @@ def _pasted(rows: Tensor, w_x: Tensor, channels: int = 4) -> Tensor:
     return (rows @ w_x).unflatten(-2, (channels, -1))
 
 
-def _weights(masks: Tensor, strength: Tensor) -> Tensor:
-    """Softmax over cells (dim 1) of strength times mask; a cell that does not cover a pixel has the logit 0."""
+def _weights(masks: Tensor, strength: Tensor, count: int) -> Tensor:
+    """Softmax over `count` cells of strength times mask, for those along dim 1.
+
+    A cell that does not cover a pixel has the logit 0, also one that is left out.
+    """
     logit = masks * strength[..., None, None]
-    weights = logit.sub_(logit.amax(1, keepdim=True)).clamp_min_(LOWEST).exp_()
-    return weights.div_(weights.sum(1, keepdim=True))
+    largest = logit.amax(1, keepdim=True)  # at least 0
+    weights = logit.sub_(largest).clamp_min_(LOWEST).exp_()
+    total = weights.sum(1, keepdim=True)
+    if len(strength[0]) < count:
+        total.add_(largest.neg_().clamp_min_(LOWEST).exp_(), alpha=count - len(strength[0]))
+    return weights.div_(total)
 
 
 def compose(

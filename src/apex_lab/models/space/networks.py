@@ -150,7 +150,8 @@ class ImageEncoder(nn.Module):
 
     def forward(self, images: Float[Tensor, "n 3 H W"]) -> Float[Tensor, "n 128 G G"]:
         trunk = self.trunk(cpu_layout(images))
-        return self.merge(torch.cat([trunk, self.lateral(trunk)], dim=1))
+        # in the usual layout: noise is drawn in that of what it is for
+        return self.merge(torch.cat([trunk, self.lateral(trunk)], dim=1)).contiguous()
 
 
 class GlimpseEncoder(nn.Module):

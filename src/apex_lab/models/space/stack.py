@@ -5,8 +5,8 @@ every normalisation and activation would read and write all of them, far more th
 for memory. Image by image, what is read from memory is a convolution's output, once forward and twice backward; the
 rest stays in the cache, and only those outputs are kept for the backward pass.
 
-BatchNorm takes away whatever is the same for all pixels of a channel. So the convolutions leave out their bias, whose
-gradient is zero, and take away the first image's means instead: plain sums of squares then lose nothing to rounding.
+BatchNorm takes away whatever is the same for all pixels of a channel. So the convolutions leave out their bias and take
+away the first image's means instead: plain sums of squares then lose nothing to rounding.
 """
 
 from __future__ import annotations
@@ -119,18 +119,19 @@ class _Stack(torch.autograd.Function):
         for i in reversed(range(n)):
             kernel, offset = weights[4 * i : 4 * i + 2]
             to_outputs, to_gain, to_shift = _through_norm(scales[i], passed, outputs[i])
-            to_kernel = torch.zeros_like(kernel)
+            to_kernel, to_offset = torch.zeros_like(kernel), torch.zeros_like(offset)
             inputs = scales[i - 1].activated(outputs[i - 1]) if i > 0 else _first(by_latent, by_place)
             for m, (to_y, x) in enumerate(zip(to_outputs, inputs, strict=True)):
                 to_x, of_kernel, _ = torch.ops.aten.convolution_backward(
                     to_y, x, kernel, None, [1, 1], [0, 0], [1, 1], False, [0, 0], 1, [True, True, False]
                 )
                 to_kernel += of_kernel
+                to_offset += to_y.sum((0, 2, 3))  # nothing but rounding
                 passed[m] = through_elu(to_x, x)
                 if i == 0:
                     to_latent[m] = passed[m].sum((0, 2, 3))
                     to_place += passed[m]
-            to_weights = [to_kernel, torch.zeros_like(offset), to_gain, to_shift, *to_weights]
+            to_weights = [to_kernel, to_offset, to_gain, to_shift, *to_weights]
         return None, to_latent, to_place, to_head, to_bias, *to_weights
 
 
@@ -187,7 +188,9 @@ def _through_norm(
     def to_outputs() -> Iterator[Tensor]:
         found = torch.empty_like(rows_of(outputs[0]))
         for g, y in zip(passed, outputs, strict=True):
-            yield images_of(torch.addcmul(rows[0], rows_of(y), rows[1], out=found).addcmul_(rows_of(g), rows[2]), channels)
+            yield images_of(
+                torch.addcmul(rows[0], rows_of(y), rows[1], out=found).addcmul_(rows_of(g), rows[2]), channels
+            )
 
     return to_outputs(), product.to(kind), plain.to(kind)
 
