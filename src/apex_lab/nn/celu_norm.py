@@ -1,7 +1,7 @@
 """CELU and then GroupNorm, the order of SPACE's and SCALOR's blocks, in fewer passes over memory on a CPU.
 
-PyTorch's CELU computes `expm1`, which is slow there (`nn/rows.py`). Its GroupNorm of channels-last images, the layout in
-which convolutions are fast, takes up to four times as long for few channels as for images whose channels are planes.
+PyTorch's CELU computes `expm1`, which is slow there (`nn/rows.py`). Its GroupNorm of channels-last images, the layout
+in which convolutions are fast, takes up to four times as long for few channels as that of images of contiguous planes.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -92,6 +92,14 @@ def cpu_layout(x: Tensor) -> Tensor:
     """Channels last on a CPU, where convolutions to few channels, strided and unpadded ones, and BatchNorm are faster
     so; what follows keeps the layout."""
     return x.contiguous(memory_format=torch.channels_last) if x.device.type == "cpu" else x
+
+
+def in_parts(layers: Callable[[Tensor], Tensor], x: Tensor, values_each: int) -> Tensor:
+    """Layers on parts of x whose largest maps, of `values_each` numbers an item, fit a CPU's cache.
+
+    First layers have small maps and large weights, so they take larger parts than the last ones.
+    """
+    return joined(layers(part) for part in x.split(part_size(len(x), values_each, x)))
 
 
 def upsample(inputs: int, outputs: int, factor: int, groups: int) -> nn.Sequential:
@@ -178,8 +186,7 @@ class GlimpseEncoder(nn.Module):
         self.largest = 16 * size**2
 
     def forward(self, crops: Float[Tensor, "m 3 g g"]) -> Float[Tensor, "m two_what"]:
-        parts = crops.split(part_size(len(crops), self.largest, crops))
-        return self.head(joined(self.convs(cpu_layout(part)) for part in parts))
+        return self.head(in_parts(lambda part: self.convs(cpu_layout(part)), crops, self.largest))
 
 
 class GlimpseDecoder(nn.Module):
@@ -203,18 +210,17 @@ class GlimpseDecoder(nn.Module):
         self.trunk = nn.Sequential(*layers)
         self.colour = nn.Conv2d(16, 3, 3, padding=1)
         self.mask = nn.Conv2d(16, 1, 3, padding=1)
-        self.largest = 16 * size**2
+        self.small, self.large = stages[-2][0] * (size // 2) ** 2, 16 * size**2
 
     def forward(self, what: Float[Tensor, "m what"]) -> tuple[Float[Tensor, "m 1 g g"], Float[Tensor, "m 3 g g"]]:
-        size = part_size(len(what), self.largest, what)
         # one convolution for both heads
         weight = torch.cat([self.mask.weight, self.colour.weight])
         assert self.mask.bias is not None
         assert self.colour.bias is not None
         bias = torch.cat([self.mask.bias, self.colour.bias])
-        drawn = joined(
-            torch.sigmoid(F.conv2d(cpu_layout(self.trunk(part)), weight, bias, padding=1))
-            for part in what[..., None, None].split(size)
+        before = in_parts(self.trunk[:-1], what[..., None, None], self.small)
+        drawn = in_parts(
+            lambda part: torch.sigmoid(F.conv2d(self.trunk[-1](part), weight, bias, padding=1)), before, self.large
         )
         return drawn[:, :1], drawn[:, 1:]
 
@@ -258,11 +264,8 @@ class SubpixelDecoder(nn.Module):
         self.small, self.large = before * (image_size // last) ** 2, inputs * image_size**2
 
     def forward(self, latent: Float[Tensor, "m latent"]) -> Float[Tensor, "m outputs H W"]:
-        # many pictures at once while maps are small, since the weights of these layers are large
-        x = latent[..., None, None]
-        x = joined(self.trunk[:-2](part) for part in x.split(part_size(len(x), self.small, x)))
-        parts = x.split(part_size(len(x), self.large, x))
-        return joined(torch.sigmoid(self.head(cpu_layout(self.trunk[-2:](part)))) for part in parts)
+        before = in_parts(self.trunk[:-2], latent[..., None, None], self.small)
+        return in_parts(lambda part: torch.sigmoid(self.head(self.trunk[-2:](part))), before, self.large)
 
 
 def mask_decoder(latent: int, image_size: int) -> SubpixelDecoder:

@@ -19,7 +19,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.nn.rows import along_rows, elu, images_of, rows_of, sums, through_elu
+from apex_lab.nn.rows import along_rows, elu, images_of, rows_of, through_elu
 
 
 class Statistics(NamedTuple):
