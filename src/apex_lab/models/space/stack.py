@@ -108,17 +108,20 @@ class _Stack(torch.autograd.Function):
 
         to_head, to_bias = torch.zeros_like(head), gradient.sum((0, 2, 3))
         passed: list[Tensor] = []  # gradients with respect to a layer's normalised values, of each image
+        sums = _Sums()
         for m, x in enumerate(scales[-1].activated(outputs[-1])):
             each = gradient[m].flatten(1)  # (outputs, pixels)
             to_head += (each @ _pixels(x)).view_as(head)
             to_x = (each.T @ head.flatten(1)).unflatten(0, x.shape[-2:]).permute(2, 0, 1)[None]
             passed.append(through_elu(to_x, x))
+            sums.add(passed[m], outputs[-1][m])
 
         to_weights: list[Tensor] = []
         to_latent, to_place = torch.empty_like(by_latent), torch.zeros_like(by_place)
         for i in reversed(range(n)):
             kernel, offset = weights[4 * i : 4 * i + 2]
-            to_outputs, to_gain, to_shift = _through_norm(scales[i], passed, outputs[i])
+            to_outputs, to_gain, to_shift = _through_norm(scales[i], sums, passed, outputs[i])
+            sums = _Sums()
             to_kernel, to_offset = torch.zeros_like(kernel), torch.zeros_like(offset)
             inputs = scales[i - 1].activated(outputs[i - 1]) if i > 0 else _first(by_latent, by_place)
             for m, (to_y, x) in enumerate(zip(to_outputs, inputs, strict=True)):
@@ -128,7 +131,9 @@ class _Stack(torch.autograd.Function):
                 to_kernel += of_kernel
                 to_offset += to_y.sum((0, 2, 3))  # nothing but rounding
                 passed[m] = through_elu(to_x, x)
-                if i == 0:
+                if i > 0:
+                    sums.add(passed[m], outputs[i - 1][m])
+                else:
                     to_latent[m] = passed[m].sum((0, 2, 3))
                     to_place += passed[m]
             to_weights = [to_kernel, to_offset, to_gain, to_shift, *to_weights]
@@ -164,8 +169,24 @@ def _convolved(
     return made, around, mean.to(kernel.dtype), (square - mean**2).clamp_min(0).to(kernel.dtype)
 
 
+class _Sums:
+    """What BatchNorm's gradient needs of all images: sums of the gradient, and of its product with a layer's outputs.
+
+    Added while both are in the cache.
+    """
+
+    def __init__(self) -> None:
+        self.each: list[Tensor] = []
+        self.work: Tensor | None = None
+
+    def add(self, gradient: Float[Tensor, "1 C h w"], output: Float[Tensor, "1 C h w"]) -> None:
+        self.work = torch.empty_like(output) if self.work is None else self.work
+        product = torch.mul(gradient, output, out=self.work)
+        self.each.append(torch.stack([gradient.sum((0, 2, 3)), product.sum((0, 2, 3))]))
+
+
 def _through_norm(
-    scale: Scale, passed: Sequence[Tensor], outputs: Sequence[Tensor]
+    scale: Scale, sums: _Sums, passed: Sequence[Tensor], outputs: Sequence[Tensor]
 ) -> tuple[Iterator[Float[Tensor, "1 C h w"]], Tensor, Tensor]:
     """Gradients with respect to a layer's normalised values -> to its outputs, image by image, to weight and bias.
 
@@ -173,12 +194,7 @@ def _through_norm(
     """
     channels, width = len(scale.gain), outputs[0].shape[-1]
     number = len(outputs) * outputs[0][0, 0].numel()
-    work = torch.empty_like(outputs[0])
-    each = [
-        torch.stack([g.sum((0, 2, 3)), torch.mul(g, y, out=work).sum((0, 2, 3))])
-        for g, y in zip(passed, outputs, strict=True)
-    ]
-    plain, product = torch.stack(each).double().sum(0)
+    plain, product = torch.stack(sums.each).double().sum(0)
     product = (product - scale.mean * plain) * scale.inverse
     slope = -scale.gain * scale.inverse * product / number
     still = -scale.gain * plain / number - slope * scale.mean
@@ -188,9 +204,8 @@ def _through_norm(
     def to_outputs() -> Iterator[Tensor]:
         found = torch.empty_like(rows_of(outputs[0]))
         for g, y in zip(passed, outputs, strict=True):
-            yield images_of(
-                torch.addcmul(rows[0], rows_of(y), rows[1], out=found).addcmul_(rows_of(g), rows[2]), channels
-            )
+            torch.addcmul(rows[0], rows_of(y), rows[1], out=found).addcmul_(rows_of(g), rows[2])
+            yield images_of(found, channels)
 
     return to_outputs(), product.to(kind), plain.to(kind)
 
