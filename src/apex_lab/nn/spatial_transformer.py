@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
@@ -91,6 +92,18 @@ def crop(
     rows = w_y.flatten(1, 2) @ image.transpose(1, 2).flatten(2)  # (B, K size, C W)
     crops = rows.reshape(b, k, -1, image.shape[-1]) @ w_x.transpose(-1, -2)  # (B, K, size C, size)
     return crops.unflatten(2, (size, -1)).transpose(2, 3)
+
+
+def sampled_crop(
+    image: Float[Tensor, "B C H W"], windows: Float[Tensor, "B K 4"], size: int
+) -> Float[Tensor, "B K C size size"]:
+    """`crop` by `grid_sample`: on a CPU faster for images without gradient, where it needs no scattered sum."""
+    s_y, s_x, t_y, t_x = windows[..., None].unbind(-2)
+    centres = pixel_centres(size, windows)
+    y, x = t_y + s_y * centres, t_x + s_x * centres
+    grid = torch.stack(torch.broadcast_tensors(x[:, :, None], y[..., None]), dim=-1)
+    each = zip(image, grid, strict=True)
+    return torch.stack([F.grid_sample(one.expand(len(at), -1, -1, -1), at, align_corners=False) for one, at in each])
 
 
 class Paster:

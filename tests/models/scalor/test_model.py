@@ -101,8 +101,24 @@ def test_recomputing_changes_nothing(recompute: str) -> None:
         torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-3 * float(a.abs().max()) + 1e-6)
 
 
+@pytest.mark.parametrize("curriculum", [0.0, 1.0])
+def test_drawing_after_the_loop_changes_nothing(monkeypatch: pytest.MonkeyPatch, curriculum: float) -> None:
+    """A GPU and half precision draw with gradients after the loop, a CPU in it."""
+    video, found = clip(2, 4), []
+    for fast in (True, False):
+        if not fast:
+            for name in ("models.scalor.rollout", "models.scalor.glimpses", "models.scalor.discovery", "nn.celu_stack"):
+                monkeypatch.setattr(f"apex_lab.{name}.fast_on", lambda x: False)
+        model = small(recompute="objects").double()
+        scene = run(model, video.double(), alpha_curriculum=curriculum)
+        total(scene).backward()
+        found.append([*(x.detach() for x in scene.terms.values()), scene.masks, *(p.grad for p in model.parameters())])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-6 * float(a.abs().max()) + 1e-9)
+
+
 def test_training_pass_without_gradients_is_the_same() -> None:
-    """Without gradients all candidates are drawn once, in the loop; with them only those that are present, after it."""
+    """Without gradients all candidates are drawn, in the loop; with them only those that are present."""
     model, video = small(), clip(2, 4)
     with torch.no_grad():
         plain = run(model, video)

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, same
 from apex_lab.models.scalor.latents import gaussian_of
+from apex_lab.nn.celu_stack import run_layers
 from apex_lab.nn.distributions import Gaussian
-from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.precision import full
 from apex_lab.nn.splitting import joined, part_size
 
@@ -69,7 +69,7 @@ class WeakDecoder(nn.Module):
         row, column = torch.meshgrid(axis, axis, indexing="ij")
         n = len(latent)
         spread = latent.expand(-1, -1, self.image_size, self.image_size)
-        return self.stack(torch.cat([torch.stack([row, column]).expand(n, -1, -1, -1), spread], dim=1))
+        return run_layers(self.stack, torch.cat([torch.stack([row, column]).expand(n, -1, -1, -1), spread], dim=1))
 
 
 class Background(nn.Module):
@@ -96,12 +96,16 @@ class Background(nn.Module):
         """q(z_bg) of frames, given A; gradients go through A to the objects."""
         seen = torch.cat([images, 1 - foreground[:, None]], dim=1)
         size = part_size(len(seen), 16 * (seen.shape[-1] // 2) ** 2, seen)
-        return gaussian_of(joined(self.encoder(for_convolutions(part)) for part in seen.split(size)).flatten(1))
+        return gaussian_of(joined(run_layers(self.encoder, part) for part in seen.split(size)).flatten(1))
 
     def draw(self, latent: Float[Tensor, "N Z"]) -> Float[Tensor, "N 3 H W"]:
         """RGB in [0, 1]."""
         size = part_size(len(latent), self.largest, latent)
-        return joined(torch.sigmoid(full(self.decoder(part[..., None, None]))) for part in latent.split(size))
+        parts = (part[..., None, None] for part in latent.split(size))
+        decoder = self.decoder
+        if isinstance(decoder, nn.Sequential):
+            return joined(torch.sigmoid(full(run_layers(decoder, part))) for part in parts)
+        return joined(torch.sigmoid(full(decoder(part))) for part in parts)
 
     def prior(
         self, latent: Float[Tensor, "B T Z"], before: tuple[Tensor, Tensor] | None

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from apex_lab.models.scalor.latents import GUARD, full_precision
+from apex_lab.models.scalor.windowed import composed, places_of
 from apex_lab.nn.precision import full
 from apex_lab.nn.spatial_transformer import Paster, for_paste
 from apex_lab.nn.splitting import joined, part_size
@@ -56,6 +57,9 @@ def layers_of(
     """
     with full_precision(drawn):
         nearness = torch.sigmoid(-full(depth))
+        if drawn.device.type == "cpu" and not torch.compiler.is_compiling():
+            places = places_of(for_paste(full(windows)), size)
+            return Layers(*composed(full(drawn), full(presence), nearness, counted, places))
         each = part_size(len(drawn), 4 * size * size * drawn.shape[1], drawn)
         inputs = [x.split(each) for x in (drawn, presence, nearness, windows, counted)]
         parts = [_layers_of_part(size, *part) for part in zip(*inputs, strict=True)]

@@ -14,11 +14,13 @@ from apex_lab.models.scalor.encoder import FEATURES
 from apex_lab.models.scalor.glimpses import GlimpseEncoder
 from apex_lab.models.scalor.latents import GUARD, Sampler, bounded_logit, full_precision, gaussian_of
 from apex_lab.models.scalor.recompute import Recompute
+from apex_lab.models.scalor.windowed import overlaps, places_of, reached
 from apex_lab.models.scalor.windows import SizeRule, discovered
+from apex_lab.nn.celu_stack import fast_on
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.precision import full
-from apex_lab.nn.spatial_transformer import window_of
+from apex_lab.nn.spatial_transformer import for_paste, window_of
 from apex_lab.nn.splitting import part_size
 
 MASK_CODE = 32
@@ -128,6 +130,16 @@ class Rejection:
         self.alpha, self.explained, self.ratio = alpha, explained, ratio
 
     @torch.no_grad()
+    def in_question(
+        self, windows: Float[Tensor, "B D 4"], explained: Float[Tensor, "B H W"], glimpse: int
+    ) -> Bool[Tensor, "B D"]:
+        """Which proposals reach an explained pixel; all others are kept, whatever their masks of `glimpse` pixels."""
+        places = places_of(for_paste(full(windows)), explained.shape[-1])
+        taken = (explained > self.explained).to(places.y.dtype)
+        y, x = (inside.to(taken.dtype) for inside in reached(places, glimpse))
+        return ((y @ taken) * x).sum(-1) > 0
+
+    @torch.no_grad()
     def kept(
         self,
         alpha: Float[Tensor, "B D g g"],
@@ -143,7 +155,11 @@ class Rejection:
         """
         with full_precision(alpha):
             size = explained.shape[-1]
-            taken = (explained > self.explained).to(full(alpha).dtype).flatten(1)[..., None]
+            taken = (explained > self.explained).to(full(alpha).dtype)
+            if fast_on(alpha):
+                mine, shared = overlaps(full(alpha), places_of(for_paste(full(windows)), size), self.alpha, taken)
+                return shared / (mine + GUARD) < self.ratio
+            taken = taken.flatten(1)[..., None]
             each = part_size(alpha.shape[1], size * size * len(alpha), alpha)
             shares = []
             for some, places in zip(alpha.split(each, 1), windows.split(each, 1), strict=True):

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from apex_lab.models.scalor.blocks import GROUPS, enlarged, halved, same
 from apex_lab.models.scalor.latents import full_precision
-from apex_lab.models.scalor.redraw import redrawn
+from apex_lab.nn.celu_stack import Block, Layer, fast_on, run_stack, side_by_side, stack_of
 from apex_lab.nn.layout import for_convolutions
-from apex_lab.nn.spatial_transformer import crop
+from apex_lab.nn.spatial_transformer import crop, sampled_crop
 from apex_lab.nn.splitting import joined, part_size
 
 CODE = 128
@@ -57,10 +57,15 @@ class GlimpseEncoder(nn.Module):
 
     def encode(self, glimpses: Float[Tensor, "N 3 g g"]) -> Float[Tensor, "N two_Z"]:
         """Means, then raw standard deviations."""
+        if fast_on(glimpses):
+            head = Block(Layer(1, 0), self.head.weight[..., None, None], self.head.bias)
+            return run_stack([*stack_of(self.stack), head], glimpses, len(glimpses)).flatten(1)
         return self.head(self.stack(for_convolutions(glimpses)).flatten(1))
 
     def _cut(self, images: Tensor, windows: Tensor) -> Float[Tensor, "BK 3 g g"]:
         with full_precision(images):
+            if fast_on(images) and not images.requires_grad:
+                return sampled_crop(images, windows, self.size).flatten(0, 1)
             return crop(images, windows, self.size).flatten(0, 1)
 
     def forward(self, images: Float[Tensor, "B 3 H W"], windows: Float[Tensor, "B K 4"]) -> Float[Tensor, "B K two_Z"]:
@@ -102,20 +107,24 @@ class GlimpseDecoder(nn.Module):
         self.trunk = nn.Sequential(*layers)
         self.colour, self.alpha = Head(3, deep_heads), Head(1, deep_heads)
 
-    def forward(self, what: Float[Tensor, "*batch Z"], alpha_only: bool = False) -> Float[Tensor, "*batch C g g"]:
-        """Channels: o (RGB), alpha; or alpha alone."""
-        flat = what.reshape(-1, what.shape[-1])
-        drawn = joined(self._decode(part, alpha_only) for part in flat.split(self._each(flat)))
-        return drawn.reshape(*what.shape[:-1], *drawn.shape[1:])
+    def forward(
+        self, what: Float[Tensor, "*batch Z"], alpha_only: bool = False, keep: bool = True
+    ) -> Float[Tensor, "*batch C g g"]:
+        """Channels: o (RGB), alpha; or alpha alone.
 
-    def again(
-        self, drawn: Float[Tensor, "*batch 4 g g"], what: Float[Tensor, "*batch Z"]
-    ) -> Float[Tensor, "*batch 4 g g"]:
-        """`forward(what)`, given its values `drawn`, with gradients that keep no activations."""
+        Args:
+            what: codes.
+            alpha_only: leave o out.
+            keep: keep activations for the backward pass, where `celu_stack` runs the network; else that pass draws
+                part by part again.
+        """
         flat = what.reshape(-1, what.shape[-1])
-        before = drawn.reshape(-1, *drawn.shape[-3:])
-        after = redrawn(lambda part: self._decode(part, False), self, self._each(flat), before, flat)
-        return after.reshape(drawn.shape)
+        if fast_on(flat):
+            stack = self._stack(alpha_only)
+            drawn = torch.sigmoid(run_stack(stack, flat[..., None, None], self._each(flat), keep))
+        else:
+            drawn = joined(self._decode(part, alpha_only) for part in flat.split(self._each(flat)))
+        return drawn.reshape(*what.shape[:-1], *drawn.shape[1:])
 
     def _each(self, flat: Float[Tensor, "N Z"]) -> int:
         return part_size(len(flat), 16 * self.size**2, flat)
@@ -123,6 +132,12 @@ class GlimpseDecoder(nn.Module):
     def _decode(self, what: Float[Tensor, "N Z"], alpha_only: bool) -> Float[Tensor, "N C g g"]:
         features = self.trunk(what[..., None, None])
         return torch.sigmoid(self.alpha(features) if alpha_only else self._heads(features))
+
+    def _stack(self, alpha_only: bool) -> list[Block]:
+        """Trunk and heads as one network."""
+        alpha = stack_of(self.alpha.layers())
+        heads = alpha if alpha_only else side_by_side(stack_of(self.colour.layers()), alpha)
+        return [*stack_of(self.trunk), *heads]
 
     def _heads(self, features: Tensor) -> Tensor:
         """Both heads as one network, their hidden layers side by side."""
@@ -149,6 +164,10 @@ class Head(nn.Module):
         self.hidden = nn.Conv2d(16, 8, 3, padding=1) if deep else None
         self.norm = nn.GroupNorm(GROUPS[8], 8) if deep else None
         self.out = nn.Conv2d(8 if deep else 16, outputs, 3, padding=1)
+
+    def layers(self) -> list[nn.Module]:
+        """One after the other."""
+        return [self.out] if self.hidden is None or self.norm is None else [self.hidden, nn.CELU(), self.norm, self.out]
 
     def forward(self, features: Float[Tensor, "N 16 g g"]) -> Float[Tensor, "N outputs g g"]:
         if self.hidden is not None and self.norm is not None:

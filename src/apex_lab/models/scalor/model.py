@@ -15,6 +15,7 @@ from apex_lab.models.scalor.encoder import VideoEncoder
 from apex_lab.models.scalor.latents import GUARD, full_precision
 from apex_lab.models.scalor.objective import Terms, added, discovery_terms, propagation_terms
 from apex_lab.models.scalor.recompute import Level, Recompute
+from apex_lab.models.scalor.rendering import render
 from apex_lab.models.scalor.result import (
     Frame,
     Readout,
@@ -69,7 +70,8 @@ class Scalor(SceneModel):
             "dropped": see `result.frame_masks`.
         recompute: activations that are computed again in the backward pass instead of being kept: "nothing";
             "objects": of the glimpse decoder and the composition; "everything": of the glimpse encoder and the
-            background too. Costs time for memory (README.md), changes no result.
+            background too. Costs time for memory (README.md), changes no result. In float32 on a CPU the composition
+            keeps nothing at any level, and the glimpse decoder one map of each layer, but at "everything" none.
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_depth", "kl_pres", "kl_background")
@@ -133,7 +135,7 @@ class Scalor(SceneModel):
         noise = context.noise if self.training or self.latents == "samples" else None
         features, memory = self.encoder(video, None if before is None else before.memory)
         steps, slots = self.objects(video, features, None if before is None else before.slots, noise, context.schedule)
-        layers = self.objects.render(steps, context.schedule)
+        layers = render(self.objects, steps, context.schedule)
         with full_precision(video):
             rendered, background, terms = self._render(video, layers, before, noise)
             terms |= added(

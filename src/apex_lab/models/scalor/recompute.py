@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import torch
-from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 Level = Literal["nothing", "objects", "everything"]
@@ -22,13 +21,9 @@ class Recompute:
     """
 
     def __init__(self, active: bool) -> None:
-        self._active = active
-
-    def draws_twice(self, like: Tensor) -> bool:
-        """Whether glimpses get gradients by `GlimpseDecoder.again`: on a CPU, and not where a compiler traces."""
-        return self._active and like.device.type == "cpu" and not torch.compiler.is_compiling()
+        self.active = active
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        if not self._active or not torch.is_grad_enabled():
+        if not self.active or not torch.is_grad_enabled():
             return function(*arguments)
         return checkpoint(function, *arguments, use_reentrant=False, preserve_rng_state=False)

@@ -12,9 +12,10 @@ from torch import Tensor
 from apex_lab.models.scalor.composition import Layers, paster_of
 from apex_lab.models.scalor.latents import GUARD
 from apex_lab.models.scalor.rollout import Step, joined_candidates
+from apex_lab.models.scalor.windowed import places_of, squares
 from apex_lab.nn.precision import full
 from apex_lab.nn.slots import gather_slots
-from apex_lab.nn.spatial_transformer import window_of
+from apex_lab.nn.spatial_transformer import for_paste, window_of
 from apex_lab.nn.splitting import part_size
 
 Readout = Literal["rendering", "overlay"]
@@ -46,6 +47,13 @@ class Shapes(NamedTuple):
             mask = paster_of(windows, alpha.shape[-1], size).each(present[:, :, None]).squeeze(2)
             yield mask, torch.sigmoid(-full(depth))[..., None, None] * mask
 
+    def weighed(self, size: int) -> Float[Tensor, "B K H W"]:
+        """Products of masks and importances in images of `size` px."""
+        if self.alpha.device.type != "cpu" or torch.compiler.is_compiling():
+            return torch.cat([importance * mask for mask, importance in self.pasted(size)], dim=1)
+        factors = torch.sigmoid(-full(self.depth)) * self.presence.square()
+        return squares(full(self.alpha), factors, places_of(for_paste(full(self.windows)), size))
+
 
 class Frame:
     """The P kept objects of one frame, without gradients.
@@ -63,7 +71,9 @@ class Frame:
         self.what, self.windows, self.depth = pick("what"), window_of(pick("where")), pick("depth").squeeze(-1)
         presence = None if objects is None else objects.presence.squeeze(-1)
         self.presence = held(step, presence, step.found).detach()
-        self.alpha = held(step, None if step.drawn is None else step.drawn[:, :, -1], step.drawn_found[:, :, -1])
+        self.alpha = held(
+            step, None if step.drawn is None else step.drawn.detach()[:, :, -1], step.drawn_found[:, :, -1]
+        )
         self.kept = step.kept
         self._step = step
 
@@ -109,10 +119,10 @@ def frame_masks(
     if readout == "overlay":
         masks = _overlay(frame, foreground, untracked)
     else:
-        masks = torch.cat([importance * mask for mask, importance in frame.objects().pasted(size)], dim=1)
+        masks = frame.objects().weighed(size)
         share = layers.share if untracked == "background" else masks.sum(1)
         total = (share + (1 - foreground) * (layers.weight.detach() + GUARD)).clamp_min(GUARD)
-        masks = masks / total[:, None]
+        masks = masks.div_(total[:, None])
     return torch.cat([masks, (1 - masks.sum(1, keepdim=True)).clamp_min(0)], dim=1)
 
 

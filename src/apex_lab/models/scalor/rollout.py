@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from apex_lab.models.scalor.composition import Layers, clamped, layers_of, paster_of
+from apex_lab.models.scalor.composition import clamped, paster_of
 from apex_lab.models.scalor.discovery import Discovery, Proposals, Rejection, room
 from apex_lab.models.scalor.encoder import LSTMState
 from apex_lab.models.scalor.glimpses import GlimpseDecoder, GlimpseEncoder
@@ -17,14 +17,12 @@ from apex_lab.models.scalor.propagation import Propagated, Propagation
 from apex_lab.models.scalor.recompute import Recompute
 from apex_lab.models.scalor.slots import FIRST_ID, Objects, Slots, admitted, carry, keep, pack, strongest
 from apex_lab.models.scalor.windows import SizeRule
+from apex_lab.nn.celu_stack import fast_on
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.nn.precision import full
 from apex_lab.nn.slots import gather_slots, leading, padded
 from apex_lab.nn.spatial_transformer import window_of
 from apex_lab.scene import ABSENT, Noise, Schedule
-
-CURRICULUM_ALPHA = 0.9
-"""Mask of every proposal under the alpha curriculum, when the foreground's mask is computed."""
 
 
 class State(NamedTuple):
@@ -38,6 +36,24 @@ class State(NamedTuple):
     background: tuple[Tensor, Tensor]
 
 
+class Shown(NamedTuple):
+    """Cells of a frame with a presence above zero, as they are rendered.
+
+    cells (B, n): their indices; those that are valid come first, and n is at least 1. valid (B, n). drawn
+    (B, n, 4, g, g): o and alpha, with gradients.
+    """
+
+    cells: Int[Tensor, "B n"]
+    valid: Bool[Tensor, "B n"]
+    drawn: Float[Tensor, "B n 4 g g"]
+
+    def alpha_of(self, count: int) -> Float[Tensor, "B count 1 g g"]:
+        """Alpha of all `count` cells without gradient, zero where they are not shown."""
+        alpha = self.drawn.detach()[:, :, 3:] * self.valid[..., None, None, None]
+        cells = self.cells[..., None, None, None].expand_as(alpha)
+        return alpha.new_zeros(len(alpha), count, *alpha.shape[2:]).scatter_add_(1, cells, alpha)
+
+
 class Step(NamedTuple):
     """One frame as the loop leaves it; P propagated slots, D discovery cells.
 
@@ -45,7 +61,9 @@ class Step(NamedTuple):
     alive (B, P): the slot came into the frame with an object.
     proposals: before rejection.
     accepted (B, D): not rejected. found (B, D): z_pres after rejection and training's cap.
-    drawn (B, P, C, g, g) or None, drawn_found (B, D, C, g, g): alpha without gradient; after o where gradients are off.
+    drawn (B, n, C, g, g) or None, drawn_found (B, D, C, g, g): alpha, of the leading n slots and of the cells. Where
+        gradients are off, o (RGB) before it; where `shown` is given, `drawn` has o too, and gradients.
+    shown: None where it is drawn later what is rendered.
     source, kept, ids (B, P): what the slots hold after the frame, as in `slots.Kept`.
     """
 
@@ -54,8 +72,9 @@ class Step(NamedTuple):
     proposals: Proposals
     accepted: Bool[Tensor, "B D"]
     found: Float[Tensor, "B D"]
-    drawn: Float[Tensor, "B P C g g"] | None
+    drawn: Float[Tensor, "B n C g g"] | None
     drawn_found: Float[Tensor, "B D C g g"]
+    shown: Shown | None
     source: Int[Tensor, "B P"]
     kept: Bool[Tensor, "B P"]
     ids: Int[Tensor, "B P"]
@@ -130,6 +149,10 @@ class ObjectNetworks(nn.Module):
             found = proposals.presence.squeeze(-1) * accepted
             if self.training:
                 found = found * strongest(found.detach(), room(slots.valid, self.max_objects))
+            shown = self._shown(proposals, found) if self._draws_at_once(video) else None
+            if drawn_found is None:
+                assert shown is not None
+                drawn_found = shown.alpha_of(found.shape[1])
             source, after = self._keep(slots, propagated, proposals, found, schedule)
             steps.append(
                 Step(
@@ -140,6 +163,7 @@ class ObjectNetworks(nn.Module):
                     found,
                     drawn,
                     drawn_found,
+                    shown,
                     source,
                     after.valid,
                     after.ids,
@@ -171,30 +195,64 @@ class ObjectNetworks(nn.Module):
         )
         objects = propagated.objects
         some = leading(slots.valid)
-        drawn = self._drawn(objects.what[:, :some])
+        what = objects.what[:, :some]
+        drawn = self._decoded(what) if self._draws_at_once(what) else self._drawn(what)
         with torch.no_grad(), full_precision(image):
             masks = full(drawn[:, :, -1]) * objects.presence[:, :some, :, None]
             windows = window_of(objects.where[:, :some])
             explained = paster_of(windows, masks.shape[-1], self.image_size).total(masks)
-        return propagated, padded(drawn, slots.valid.shape[1]), explained
+        return propagated, drawn, explained
 
     def _propose(
         self, image: Tensor, feature: Tensor, explained: Tensor | None, sampler: Sampler
-    ) -> tuple[Proposals, Tensor, Tensor]:
-        """Proposals, drawn, and which of them propagated objects do not explain already."""
+    ) -> tuple[Proposals, Tensor | None, Tensor]:
+        """Proposals, drawn, and which of them propagated objects do not explain already.
+
+        Not drawn where the loop draws those with a presence once more, with gradients.
+        """
         mask = clamped(torch.zeros_like(image[:, 0]) if explained is None else explained)
         proposals = self.discovery(feature, mask, image, self.glimpse_encoder, sampler, self.recompute_looks)
+        windows = window_of(proposals.where).detach()
+        if self._draws_at_once(image):
+            return proposals, None, self._accepted(proposals.what, windows, None if explained is None else mask)
         drawn = self._drawn(proposals.what)
         if explained is None:
             return proposals, drawn, torch.ones_like(proposals.logit, dtype=torch.bool)
-        windows = window_of(proposals.where).detach()
         return proposals, drawn, self.rejection.kept(drawn[:, :, -1], windows, mask)
+
+    @torch.no_grad()
+    def _accepted(self, what: Tensor, windows: Tensor, explained: Tensor | None) -> Bool[Tensor, "B D"]:
+        """Proposals that are not rejected; only those are drawn that reach explained pixels."""
+        accepted = torch.ones(what.shape[:2], dtype=torch.bool, device=what.device)
+        if explained is None:
+            return accepted
+        cells, valid = pack(self.rejection.in_question(windows, explained, self.glimpse_decoder.size), what.shape[1])
+        some = leading(valid)
+        cells, valid = cells[:, :some], valid[:, :some]
+        alpha = self.glimpse_decoder(gather_slots(what, cells), alpha_only=True)[:, :, -1]
+        rejected = valid & ~self.rejection.kept(alpha, gather_slots(windows, cells), explained)
+        return torch.zeros_like(accepted, dtype=torch.long).scatter_add_(1, cells, rejected.long()) == 0
+
+    def _draws_at_once(self, like: Tensor) -> bool:
+        """Whether the loop draws with gradients what it knows to be rendered; elsewhere shapes would depend on data."""
+        return torch.is_grad_enabled() and fast_on(like)
 
     def _drawn(self, what: Float[Tensor, "B K Z"]) -> Float[Tensor, "B K C g g"]:
         """Masks for the decisions of the loop, which have no gradient; colours too if these drawings are rendered."""
-        alpha_only = torch.is_grad_enabled() and not self.recompute.draws_twice(what)
+        alpha_only = torch.is_grad_enabled()
         with torch.no_grad():
             return self.glimpse_decoder(what, alpha_only)
+
+    def _decoded(self, what: Float[Tensor, "B K Z"]) -> Float[Tensor, "B K 4 g g"]:
+        """Drawings with gradients."""
+        return self.glimpse_decoder(what, keep=not self.recompute_looks.active)
+
+    def _shown(self, proposals: Proposals, found: Float[Tensor, "B D"]) -> Shown:
+        """Drawings of the cells with a presence above zero."""
+        cells, valid = pack(found.detach() > 0, found.shape[1])
+        some = leading(valid)
+        cells, valid = cells[:, :some], valid[:, :some]
+        return Shown(cells, valid, self._decoded(gather_slots(proposals.what, cells)))
 
     def _keep(
         self, slots: Slots, propagated: Propagated | None, proposals: Proposals, found: Tensor, schedule: Schedule
@@ -216,65 +274,13 @@ class ObjectNetworks(nn.Module):
         objects = carry((old, new), kept, schedule["slot_gradient"])
         return kept.source, Slots(objects, kept.valid, kept.ids, kept.next_id)
 
-    def render(self, steps: list[Step], schedule: Schedule) -> Layers:
-        """All frames of a video as they are rendered, (B, T, ...) in place of (N, ...).
-
-        In training at most P of the P + D candidates of a frame have a presence above zero (the cap on discoveries
-        sees to that), so only these are drawn with gradients.
-        """
-        values = torch.stack([_rendered(step) for step in steps], dim=1)
-        slots, count = steps[0].alive.shape[1], values.shape[2]
-        full = steps[0].drawn_found.shape[2] > 1
-        drawn = [joined_candidates(step, step.drawn, step.drawn_found) if full else None for step in steps]
-        index = torch.arange(count, device=values.device).expand(values.shape[:3])
-        most = [count] * len(steps)
-        if self.training and torch.is_grad_enabled():
-            present = values[..., 0].detach().flatten(0, 1) > 0
-            index, valid = (x.unflatten(0, values.shape[:2]) for x in pack(present, min(self.max_objects, count)))
-            presence, others = gather_slots(values, index, dim=2).split([1, values.shape[-1] - 1], dim=-1)
-            values = torch.cat([presence * valid[..., None], others], dim=-1)
-            drawn = [x if x is None else gather_slots(x, at) for x, at in zip(drawn, index.unbind(1), strict=True)]
-            most = [leading(frame) for frame in valid.unbind(1)]
-        curriculum = (schedule["alpha_curriculum"] > 0.5) & (index >= slots)
-        counted = torch.where(curriculum, 0.0, 1.0)
-        frames = [
-            self._frame(n, picture, some, weights)
-            for n, picture, some, weights in zip(most, drawn, values.unbind(1), counted.unbind(1), strict=True)
-        ]
-        layers = Layers(*(torch.stack(sums, dim=1) for sums in zip(*frames, strict=True)))
-        every = torch.where(schedule["alpha_curriculum"] > 0.5, CURRICULUM_ALPHA * steps[0].found.shape[1], 0.0)
-        return layers._replace(alpha=layers.alpha + every)
-
-    def _frame(self, n: int, drawn: Tensor | None, values: Tensor, counted: Tensor) -> Layers:
-        """The leading `n` candidates of a frame."""
-        values, counted = values[:, :n], counted[:, :n]
-        if drawn is not None:
-            drawn = drawn[:, :n]
-            if torch.is_grad_enabled():
-                drawn = self.glimpse_decoder.again(drawn, values[..., -self.what :])
-        return self.recompute(self._layers, drawn, values, counted)
-
-    def _layers(self, drawn: Tensor | None, values: Tensor, counted: Tensor) -> Layers:
-        presence, depth, where, what = values.split([1, 1, 4, self.what], dim=-1)
-        if drawn is None:
-            drawn = self.glimpse_decoder(what)
-        return layers_of(drawn, presence.squeeze(-1), depth.squeeze(-1), window_of(where), counted, self.image_size)
-
-
-def _rendered(step: Step) -> Float[Tensor, "B K D"]:
-    """Presence, depth, place and appearance of a frame's candidates side by side."""
-    new = torch.cat([step.found[..., None], step.proposals.depth, step.proposals.where, step.proposals.what], dim=-1)
-    if step.propagated is None:
-        return joined_candidates(step, None, new)
-    old = step.propagated.objects
-    return joined_candidates(step, torch.cat([old.presence, old.depth, old.where, old.what], dim=-1), new)
-
 
 def joined_candidates(step: Step, propagated: Tensor | None, found: Tensor) -> Tensor:
-    """(B, P, ...) and (B, D, ...) -> (B, P + D, ...); zeros for the P slots of a video's first frame."""
+    """(B, n, ...) of the leading slots and (B, D, ...) -> (B, P + D, ...); zeros for the P slots of a first frame."""
+    slots = step.alive.shape[1]
     if propagated is None:
-        propagated = found.new_zeros(*step.alive.shape, *found.shape[2:])
-    return torch.cat([propagated, found], dim=1)
+        propagated = found.new_zeros(len(found), slots, *found.shape[2:])
+    return torch.cat([padded(propagated, slots), found], dim=1)
 
 
 def gaussians(frames: list[Gaussian]) -> Gaussian:
