@@ -150,19 +150,13 @@ class Muon(Optimizer):
         updates, means, squares = ([self.state[w][key] for w in weights] for key in ("updates", "mean", "square"))
         beta1, beta2 = group["beta1"], group["beta2"]
         torch._foreach_add_(updates, 1)
+        made = torch.stack(updates)
         torch._foreach_lerp_(means, grads, 1 - beta1)
         torch._foreach_lerp_(squares, torch._foreach_mul(grads, grads), 1 - beta2)
-        spread = torch._foreach_div(squares, _one_minus_power(beta2, updates))
+        spread = torch._foreach_div(squares, (1 - beta2**made).unbind())
         torch._foreach_sqrt_(spread)
         torch._foreach_add_(spread, group["eps"])
-        torch._foreach_mul_(spread, _one_minus_power(beta1, updates))
+        torch._foreach_mul_(spread, (1 - beta1**made).unbind())
         changes = torch._foreach_mul(means, group["lr"])
         torch._foreach_div_(changes, spread)
         torch._foreach_sub_(weights, changes)
-
-
-def _one_minus_power(base: float, exponents: Sequence[Tensor]) -> Sequence[Tensor]:
-    powers = torch._foreach_pow(base, exponents)
-    torch._foreach_neg_(powers)
-    torch._foreach_add_(powers, 1)
-    return powers
