@@ -235,7 +235,8 @@ class Discovery(nn.Module):
         cells = features.flatten(0, 1)[..., step // 2 :: step, step // 2 :: step]  # c_d, equally spaced
         d = self.grid**2
         # Eq. 16, last factor: z_where
-        q_where = gaussian_from(self.head_where(cells).flatten(2).transpose(1, 2))  # (B T, D, 4)
+        raw = self.head_where(cells).contiguous()  # in this layout noise is drawn, on every device
+        q_where = gaussian_from(raw.flatten(2).transpose(1, 2))  # (B T, D, 4)
         place = self.windows.discovered(q_where.sample(noise))
         window = window_of(place)
 
