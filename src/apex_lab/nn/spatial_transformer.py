@@ -95,7 +95,7 @@ def paste_weights(
     return _triangle((at + 1) * (source / 2) - 0.5, source).transpose(-1, -2)
 
 
-def _by_axis(windows: Float[Tensor, "*batch 4"]) -> tuple[Float[Tensor, "2 *batch"], Float[Tensor, "2 *batch"]]:
+def _by_axis(windows: Float[Tensor, "*batch 4"]) -> tuple[Float[Tensor, "2 ..."], Float[Tensor, "2 ..."]]:
     """Sizes and centres along y and x, so that one pass makes the weights of both axes."""
     size, centre = windows.movedim(-1, 0).contiguous().split(2)
     return size, centre

@@ -12,8 +12,8 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from apex_lab.nn.blocks import BroadcastDecoder, conv_norm, mlp
-from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.distributions import Gaussian, gaussian_from, standard_normal
+from apex_lab.nn.layout import for_convolutions
 
 Count = Annotated[int, Field(gt=0)]
 

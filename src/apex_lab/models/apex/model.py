@@ -19,8 +19,8 @@ from apex_lab.models.apex.masks import MaskNormalisation, Masks
 from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, mask_entropy
 from apex_lab.models.apex.objects import (
     Appearance,
-    Discovery,
     Beliefs,
+    Discovery,
     Objects,
     Posterior,
     Propagation,
