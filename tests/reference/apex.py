@@ -132,7 +132,7 @@ class Straightforward(Apex):
     ) -> Step:
         """Propagation, presence of discoveries, filtering: the body of the loop in `Apex._roll_out`."""
         temperature = schedule["temperature"]
-        before, beliefs = self.propagation(
+        before, posterior = self.propagation(
             memory.objects,
             self.glimpses,
             self.appearance,
@@ -165,7 +165,7 @@ class Straightforward(Apex):
             candidates.presence,
             exists & (candidates.presence > 0),
             alive,
-            beliefs,
+            self.propagation.beliefs(posterior),
             prob,
             prior,
             pres,

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.spatial_transformer import pixel_centres
 from apex_lab.nn.splitting import joined, part_size
 
@@ -31,6 +32,17 @@ def mlp(sizes: Sequence[int]) -> nn.Sequential:
     for inputs, outputs in itertools.pairwise(sizes):
         layers += [nn.Linear(inputs, outputs), nn.CELU()]
     return nn.Sequential(*layers[:-1])
+
+
+class _Maps(nn.Module):
+    """Vectors -> feature maps (channels, side, side) of their values."""
+
+    def __init__(self, channels: int, side: int) -> None:
+        super().__init__()
+        self.shape = (channels, side, side)
+
+    def forward(self, x: Float[Tensor, "N values"]) -> Float[Tensor, "N C side side"]:
+        return for_convolutions(x.unflatten(1, self.shape))
 
 
 class GlimpseEncoder(nn.Module):
@@ -57,7 +69,7 @@ class GlimpseEncoder(nn.Module):
         self.shortcut = nn.Linear(channels * full * full, outputs, bias=False)
 
     def forward(self, crops: Float[Tensor, "N C g g"]) -> Float[Tensor, "N outputs"]:
-        return self.head(self.convs(crops).flatten(1)) + self.shortcut(crops.flatten(1))
+        return self.head(self.convs(for_convolutions(crops)).flatten(1)) + self.shortcut(crops.flatten(1))
 
 
 class SubpixelDecoder(nn.Module):
@@ -79,7 +91,7 @@ class SubpixelDecoder(nn.Module):
             raise ValueError(f"a glimpse of {size} pixels is not 4 times a power of two, such as 16, 32 or 64")
         widths = [width * min(4, 2 ** (doublings - 1 - i)) for i in range(doublings)]
         self.stem = nn.Linear(latent, widths[0] * 16)
-        blocks: list[nn.Module] = [nn.Unflatten(1, (widths[0], 4, 4)), nn.CELU()]
+        blocks: list[nn.Module] = [_Maps(widths[0], 4), nn.CELU()]
         for inputs, after in itertools.pairwise(widths):
             blocks += [nn.Conv2d(inputs, 4 * after, 3, padding=1), nn.PixelShuffle(2), group_norm(after), nn.CELU()]
         self.blocks = nn.Sequential(*blocks)
@@ -125,4 +137,4 @@ class BroadcastDecoder(nn.Module):
     def forward(self, latent: Float[Tensor, "N latent"]) -> Float[Tensor, "N outputs size size"]:
         axis = pixel_centres(self.grid, latent)
         coordinates = torch.stack(torch.meshgrid(axis, axis, indexing="ij"))[None]
-        return self.head(self.blocks(self.stem(latent)[..., None, None] + self.place(coordinates)))
+        return self.head(self.blocks(for_convolutions(self.stem(latent)[..., None, None] + self.place(coordinates))))

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from apex_lab.nn.blocks import conv_norm, group_norm
+from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.splitting import joined, part_size
 
 
@@ -122,7 +123,7 @@ class DLA(nn.Module):
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N F H/4 W/4"]:
         # At full resolution images are many and weights few: in parts.
         size = part_size(len(images), self.widest * images.shape[-2:].numel(), images)
-        x = joined(self.stem(part) for part in images.split(size))
+        x = joined(self.stem(for_convolutions(part)) for part in images.split(size))
         maps = []
         for tree in self.trees:
             x = tree(x)

@@ -8,6 +8,7 @@ deterministic on CUDA too, and needs no gather.
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import torch
@@ -32,7 +33,19 @@ def for_paste(windows: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
 
 def pixel_centres(n: int, like: Tensor) -> Float[Tensor, " n"]:
     """Centres of `n` pixels on the axis [-1, 1]."""
-    return (2 * torch.arange(n, device=like.device, dtype=like.dtype) + 1) / n - 1
+    if like.device.type != "cpu" or torch.compiler.is_compiling():
+        return (2 * torch.arange(n, device=like.device, dtype=like.dtype) + 1) / n - 1
+    return _pixel_centres(n, like.dtype)
+
+
+@functools.cache
+def _pixel_centres(n: int, dtype: torch.dtype) -> Tensor:
+    return (2 * torch.arange(n, dtype=dtype) + 1) / n - 1
+
+
+@functools.cache
+def _indices(n: int, dtype: torch.dtype) -> Tensor:
+    return torch.arange(n, dtype=dtype)
 
 
 class _Triangle(torch.autograd.Function):
@@ -45,7 +58,10 @@ class _Triangle(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, position: Tensor, n: int) -> Tensor:  # type: ignore[override]
         ctx.save_for_backward(position)
-        j = torch.arange(n, device=position.device, dtype=position.dtype)
+        if position.device.type == "cpu" and not torch.compiler.is_compiling():
+            j = _indices(n, position.dtype)
+        else:
+            j = torch.arange(n, device=position.device, dtype=position.dtype)
         return (position[..., None] - j).abs_().neg_().add_(1).clamp_min_(0)
 
     @staticmethod
@@ -80,13 +96,22 @@ def paste_weights(
     return _triangle((at + 1) * (source / 2) - 0.5, source).transpose(-1, -2)
 
 
+def _by_axis(windows: Float[Tensor, "*batch 4"]) -> tuple[Float[Tensor, "2 ..."], Float[Tensor, "2 ..."]]:
+    """Sizes and centres along y and x, so that one pass makes the weights of both axes."""
+    size, centre = windows.movedim(-1, 0).contiguous().split(2)
+    return size, centre
+
+
 def crop(
     image: Float[Tensor, "B C H W"], windows: Float[Tensor, "B K 4"], size: int
 ) -> Float[Tensor, "B K C size size"]:
     """Cuts K windows out of each image; zero where a window reaches beyond the image."""
-    s_y, s_x, t_y, t_x = windows.unbind(-1)
-    w_y = crop_weights(s_y, t_y, image.shape[-2], size)
-    w_x = crop_weights(s_x, t_x, image.shape[-1], size)
+    if image.shape[-2] == image.shape[-1]:
+        w_y, w_x = crop_weights(*_by_axis(windows), image.shape[-1], size).unbind()
+    else:
+        s_y, s_x, t_y, t_x = windows.unbind(-1)
+        w_y = crop_weights(s_y, t_y, image.shape[-2], size)
+        w_x = crop_weights(s_x, t_x, image.shape[-1], size)
     b, k = windows.shape[:2]
     # Channels ride along as columns, then as rows: two plain products per window, whose weights no channel repeats.
     rows = w_y.flatten(1, 2) @ image.transpose(1, 2).flatten(2)  # (B, K size, C W)
@@ -118,9 +143,7 @@ class Paster:
     """
 
     def __init__(self, windows: Float[Tensor, "... 4"], glimpse: int, size: int) -> None:
-        s_y, s_x, t_y, t_x = windows.unbind(-1)
-        self.w_y = paste_weights(s_y, t_y, glimpse, size)
-        self.w_x = paste_weights(s_x, t_x, glimpse, size)
+        self.w_y, self.w_x = paste_weights(*_by_axis(windows), glimpse, size).unbind()
 
     def each(self, glimpses: Float[Tensor, "... C g g"]) -> Float[Tensor, "... C size size"]:
         """Every glimpse in an image of its own.

@@ -53,11 +53,14 @@ def all_orthogonalised(matrices: Sequence[Float[Tensor, "_ _"]], iterations: int
 def _newton_schulz(gram: Float[Tensor, "N n n"], iterations: int) -> Float[Tensor, "N n n"]:
     """What matrices with these x x^T are to be multiplied by from the left."""
     a, b, c = QUINTIC
-    applied = torch.eye(gram.shape[-1], dtype=gram.dtype, device=gram.device).expand_as(gram)
-    for _ in range(iterations):
+    applied: Tensor | None = None
+    for left in reversed(range(iterations)):
         step = torch.baddbmm(gram, gram, gram, beta=b, alpha=c)
         step.diagonal(dim1=-2, dim2=-1).add_(a)
-        applied, gram = step @ applied, step @ gram @ step
+        applied = step if applied is None else torch.bmm(step, applied)
+        if left:
+            gram = torch.bmm(torch.bmm(step, gram), step)
+    assert applied is not None
     return applied
 
 
@@ -117,16 +120,11 @@ class Muon(Optimizer):
                 loss = closure()
         for group in self.param_groups:
             weights = [weight for weight in group["params"] if weight.grad is not None]
-            if group["matrices"]:
-                self._muon(weights, group)
-            else:
-                for weight in weights:
-                    self._adam(weight, weight.grad, self.state[weight], group)
+            if weights:
+                (self._muon if group["matrices"] else self._adam)(weights, group)
         return loss
 
     def _muon(self, weights: Sequence[Tensor], group: dict[str, Any]) -> None:
-        if not weights:
-            return
         for weight in weights:
             if not self.state[weight]:
                 self.state[weight]["momentum"] = torch.zeros_like(weight)
@@ -141,14 +139,24 @@ class Muon(Optimizer):
             stretch = max(1.0, change.shape[0] / change.shape[1]) ** 0.5
             weight.sub_(change.reshape(weight.shape), alpha=group["lr"] * stretch)
 
-    @staticmethod
-    def _adam(weight: Tensor, grad: Tensor, state: dict[str, Any], group: dict[str, Any]) -> None:
-        if not state:
-            # not "step": PyTorch leaves a tensor of that name on the CPU when it loads a state
-            state["updates"] = torch.zeros((), device=weight.device, dtype=weight.dtype)
-            state["mean"], state["square"] = torch.zeros_like(weight), torch.zeros_like(weight)
-        step, beta1, beta2 = state["updates"].add_(1), group["beta1"], group["beta2"]
-        mean = state["mean"].lerp_(grad, 1 - beta1)
-        square = state["square"].lerp_(grad.square(), 1 - beta2)
-        spread = (square / (1 - beta2**step)).sqrt_().add_(group["eps"])
-        weight.sub_(group["lr"] * mean / ((1 - beta1**step) * spread))
+    def _adam(self, weights: Sequence[Tensor], group: dict[str, Any]) -> None:
+        for weight in weights:
+            if not self.state[weight]:
+                # not "step": PyTorch leaves a tensor of that name on the CPU when it loads a state
+                updates = torch.zeros((), device=weight.device, dtype=weight.dtype)
+                mean, square = torch.zeros_like(weight), torch.zeros_like(weight)
+                self.state[weight].update(updates=updates, mean=mean, square=square)
+        grads = [cast(Tensor, weight.grad) for weight in weights]
+        updates, means, squares = ([self.state[w][key] for w in weights] for key in ("updates", "mean", "square"))
+        beta1, beta2 = group["beta1"], group["beta2"]
+        torch._foreach_add_(updates, 1)
+        made = torch.stack(updates)
+        torch._foreach_lerp_(means, grads, 1 - beta1)
+        torch._foreach_lerp_(squares, torch._foreach_mul(grads, grads), 1 - beta2)
+        spread = torch._foreach_div(squares, (1 - beta2**made).unbind())
+        torch._foreach_sqrt_(spread)
+        torch._foreach_add_(spread, group["eps"])
+        torch._foreach_mul_(spread, (1 - beta1**made).unbind())
+        changes = torch._foreach_mul(means, group["lr"])
+        torch._foreach_div_(changes, spread)
+        torch._foreach_sub_(weights, changes)

@@ -159,7 +159,7 @@ def spread(
     result = run()
     hook.remove()
     if isinstance(result, Step):
-        rows = torch.stack(said, dim=1)[result.alive]
+        rows = (said[0] if said[0].dim() == 4 else torch.stack(said, dim=1))[result.alive]  # priors: all frames at once
     else:
         rows = said[0].movedim(1 if isinstance(layer, nn.Conv2d) else -1, -1).flatten(0, -2)
     scale = torch.as_tensor(std) / rows.std(0)

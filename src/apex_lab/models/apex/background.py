@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from apex_lab.nn.blocks import BroadcastDecoder, conv_norm, mlp
 from apex_lab.nn.distributions import Gaussian, gaussian_from, standard_normal
+from apex_lab.nn.layout import for_convolutions
 
 Count = Annotated[int, Field(gt=0)]
 
@@ -79,7 +80,7 @@ class Background(nn.Module):
 
     def posterior(self, mask: Float[Tensor, "N H W"], image: Float[Tensor, "N 3 H W"]) -> Gaussian:
         """q(z_bg | m_bg, x), the first factor of Eq. 14: a CNN on the background mask and the image."""
-        return gaussian_from(self.encoder(torch.cat([mask[:, None], image], dim=1)))
+        return gaussian_from(self.encoder(for_convolutions(torch.cat([mask[:, None], image], dim=1))))
 
     def prior(self, z: Float[Tensor, "B T Z"], before: Float[Tensor, "B Z"] | None = None) -> Gaussian:
         """p(z_bg_t | z_bg_{t-1}) for every frame, the first factor of Eq. 4.

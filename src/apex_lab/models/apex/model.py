@@ -19,8 +19,10 @@ from apex_lab.models.apex.masks import MaskNormalisation, Masks
 from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, mask_entropy
 from apex_lab.models.apex.objects import (
     Appearance,
+    Beliefs,
     Discovery,
     Objects,
+    Posterior,
     Propagation,
     Proposals,
     context_probability,
@@ -28,7 +30,7 @@ from apex_lab.models.apex.objects import (
     scope_in_windows,
 )
 from apex_lab.models.apex.result import Drawn, Picture, scene_of, video_of
-from apex_lab.models.apex.rollout import Frame, Memory, State, Step, frames_of, stack_steps
+from apex_lab.models.apex.rollout import Claims, Frame, Memory, State, Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import carry
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
@@ -218,11 +220,13 @@ class Apex(SceneModel):
         masks of both, is left to `_explain`.
         """
         state, valid, ids, next_id, carried_on = memory
-        frames = frames_of(look_at, follow_in, proposals, self._alpha(proposals.what))
+        alphas = self._alpha(proposals.what)
+        with record_function("discovery"):
+            claims = self._claims(alphas, proposals.place).frames()
         steps = []
-        for frame in frames:
+        for frame, claimed in zip(frames_of(look_at, follow_in, proposals, alphas), claims, strict=True):
             with record_function("propagation"):
-                before, beliefs = self.propagation(
+                before, posterior = self.propagation(
                     state,
                     self.glimpses,
                     self.appearance,
@@ -237,7 +241,8 @@ class Apex(SceneModel):
 
             open_ = self._may_discover(carried_on, schedule, noise).to(scope.dtype)
             with record_function("discovery"):
-                context, unexplained = self._context(frame, scope)
+                context = context_probability(scope, claimed.masks)
+                unexplained = scope_in_windows(scope, claimed.rows, claimed.columns)
             prob = frame.prob * context * open_  # Eq. 17
             # Eq. 6: the prior of a discovery's presence, given the propagated objects
             prior = schedule["discovery_presence"] * unexplained * open_
@@ -256,7 +261,7 @@ class Apex(SceneModel):
                     candidates.presence,
                     exists & (candidates.presence > 0),
                     valid,
-                    beliefs,
+                    posterior,
                     prob,
                     prior,
                     pres,
@@ -268,18 +273,20 @@ class Apex(SceneModel):
             state, ids, next_id = candidates.gather(kept.source), kept.ids, kept.next_id
             carried_on = self._carried_on(carried_on, schedule, noise)
             valid = kept.valid & carried_on
-        return stack_steps(steps), Memory(state, valid, ids, next_id, carried_on)
+        video = stack_steps(steps)
+        assert isinstance(video.propagated, Posterior)
+        beliefs = self.propagation.beliefs(video.propagated)
+        return video._replace(propagated=beliefs), Memory(state, valid, ids, next_id, carried_on)
 
-    def _context(self, cells: Frame, scope: Float[Tensor, "B H W"]) -> tuple[Tensor, Tensor]:
-        """p_context of all cells, and the share of their windows that is not explained yet, each (B, D)."""
-        size = part_size(len(scope), scope[0].numel() * cells.place.shape[1], scope)
+    def _claims(self, alphas: Float[Tensor, "B T D g g"], place: Float[Tensor, "B T D 4"]) -> Claims:
+        """What all cells of all frames would cover on their own: no frame waits for another."""
+        b, t, d = place.shape[:3]
+        size = part_size(b * t, d * self.image_size**2, place)
         found = []
-        for alpha, place, left in zip(*(x.split(size) for x in (cells.alpha, cells.place, scope)), strict=True):
-            paster = self._paster(place, alpha.shape[-1])
-            context = context_probability(left, self.masks.claim(alpha, paster))
-            found.append((context, scope_in_windows(left, *paster.inside())))
-        contexts, shares = zip(*found, strict=True)
-        return joined(contexts), joined(shares)
+        for alpha, where in zip(*(x.flatten(0, 1).split(size) for x in (alphas, place)), strict=True):
+            paster = self._paster(where, alpha.shape[-1])
+            found.append(Claims(self.masks.claim(alpha, paster), *paster.inside()))
+        return Claims(*(joined(parts).unflatten(0, (b, t)) for parts in zip(*found, strict=True)))
 
     def _carried_on(self, before: Tensor, schedule: Schedule, noise: Noise | None) -> Tensor:
         """Which videos carry their objects into the next frame, (B, 1); all in evaluation.
@@ -349,6 +356,7 @@ class Apex(SceneModel):
             for part in zip(images.split(size), parts, pasters, masks, backdrop.split(size), strict=True)
         ]
         picture = video_of(pictures, b)
+        assert isinstance(steps.propagated, Beliefs)
         slots = self.max_objects
         terms = {
             # Eq. 19, and below the three factors of Eq. 4 as KL terms of Eq. 20; with the mask entropy, Eq. 22

@@ -54,6 +54,15 @@ class Objects(NamedTuple):
         return Objects(zeros[0], zeros[1], like.new_zeros(batch, slots), *zeros[2:])
 
 
+class Posterior(NamedTuple):
+    """q of one set of objects, and the hidden state of the network that gives their prior (B, K, hidden)."""
+
+    q_where: Gaussian
+    q_what: Gaussian
+    q_pres: Tensor
+    hidden_prior: Tensor
+
+
 class Beliefs(NamedTuple):
     """Distributions of one set of objects: q (posterior) and p (prior)."""
 
@@ -140,8 +149,8 @@ class Propagation(nn.Module):
         valid: Bool[Tensor, "B P"],
         temperature: Tensor,
         noise: Noise | None,
-    ) -> tuple[Objects, Beliefs]:
-        """Objects at t - 1 and the sources at t -> objects at t, with their posterior and prior."""
+    ) -> tuple[Objects, Posterior]:
+        """Objects at t - 1 and the sources at t -> objects at t, with their posterior."""
         b, p = before.presence.shape
 
         def each(cell: nn.GRUCell, hidden: Tensor, *inputs: Tensor) -> Tensor:
@@ -171,15 +180,20 @@ class Propagation(nn.Module):
         q_pres = torch.sigmoid(self.head_pres(hidden_pres)).squeeze(-1)
         z_pres = torch.where(valid, sample_presence(q_pres, temperature, noise), torch.zeros_like(q_pres))
 
-        beliefs = Beliefs(
+        objects = Objects(what, place, z_pres, hidden_where, hidden_what, hidden_pres, hidden_prior)
+        return objects, Posterior(q_where, q_what, q_pres, hidden_prior)
+
+    def beliefs(self, posterior: Posterior) -> Beliefs:
+        """With the prior (Eq. 5), which nothing in the loop over time waits for; any leading shape, such as (B, T)."""
+        q_where, q_what, q_pres, hidden = posterior
+        return Beliefs(
             q_where,
-            gaussian_from(self.prior_where(hidden_prior)),
+            gaussian_from(self.prior_where(hidden)),
             q_what,
-            gaussian_from(self.prior_what(hidden_prior)),
+            gaussian_from(self.prior_what(hidden)),
             q_pres,
-            torch.sigmoid(self.prior_pres(hidden_prior)).squeeze(-1),
+            torch.sigmoid(self.prior_pres(hidden)).squeeze(-1),
         )
-        return Objects(what, place, z_pres, hidden_where, hidden_what, hidden_pres, hidden_prior), beliefs
 
 
 class Proposals(NamedTuple):
@@ -235,7 +249,8 @@ class Discovery(nn.Module):
         cells = features.flatten(0, 1)[..., step // 2 :: step, step // 2 :: step]  # c_d, equally spaced
         d = self.grid**2
         # Eq. 16, last factor: z_where
-        q_where = gaussian_from(self.head_where(cells).flatten(2).transpose(1, 2))  # (B T, D, 4)
+        raw = self.head_where(cells).contiguous()  # in this layout noise is drawn, on every device
+        q_where = gaussian_from(raw.flatten(2).transpose(1, 2))  # (B T, D, 4)
         place = self.windows.discovered(q_where.sample(noise))
         window = window_of(place)
 
@@ -269,15 +284,15 @@ def scope_in_windows(
 
     A window too small to hold a pixel centre is fully open, as it is to p_context.
     """
-    inside = torch.einsum("bdh,bhw,bdw->bd", rows, scope, columns)
+    inside = ((rows @ scope) * columns).sum(-1)
     whole = rows.sum(-1) * columns.sum(-1)
     return torch.where(whole > 0, inside / whole.clamp_min(1e-6), torch.ones_like(whole))
 
 
 def context_probability(scope: Float[Tensor, "B H W"], claims: Float[Tensor, "B D H W"]) -> Float[Tensor, "B D"]:
     """p_context: share of each proposal's mask that is not yet explained, in [0, 1] (Eq. 18)."""
-    claims = claims.flatten(2)
-    # As one minus the explained share: with nothing propagated it is exactly one, whatever the rounding of the sums.
-    explained = (claims @ (1 - scope.flatten(1))[..., None]).squeeze(-1)
+    taken = 1 - scope.flatten(1)
+    explained, whole = (claims.flatten(2) @ torch.stack([taken, torch.ones_like(taken)], dim=-1)).unbind(-1)
     tiny = 1e-6  # a window too small to hold a pixel centre claims nothing: its context is fully open
-    return (1 - explained / (claims.sum(-1) + tiny)).clamp_min(0)
+    # As one minus the explained share: with nothing propagated it is exactly one, whatever the rounding of the sums.
+    return (1 - explained / (whole + tiny)).clamp_min(0)

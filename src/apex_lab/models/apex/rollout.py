@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from apex_lab.models.apex.objects import Beliefs, Objects, Proposals
+from apex_lab.models.apex.objects import Beliefs, Objects, Posterior, Proposals
 from apex_lab.scene import ABSENT
 
 
@@ -36,6 +36,21 @@ def frames_of(look_at: Tensor, follow_in: Tensor, proposals: Proposals, alphas: 
     """
     fields = (look_at, follow_in, proposals.what, proposals.place, proposals.prob, proposals.hidden_what, alphas)
     return [Frame(*values) for values in zip(*(x.unbind(1) for x in fields), strict=True)]
+
+
+class Claims(NamedTuple):
+    """What the cells of a frame, or with dimensions (B, T) in place of B of all frames, would cover (Eq. 18).
+
+    masks (B, D, H, W): each on its own. rows (B, D, H), columns (B, D, W): as of `Paster.inside`.
+    """
+
+    masks: Tensor
+    rows: Tensor
+    columns: Tensor
+
+    def frames(self) -> list[Claims]:
+        """Video -> frames."""
+        return [Claims(*values) for values in zip(*(x.unbind(1) for x in self), strict=True)]
 
 
 FIRST_ID = 1
@@ -86,7 +101,7 @@ class Step(NamedTuple):
     what (B, R, Z), place (B, R, 4), alpha (B, R, g, g), presence (B, R): samples; presence is zero where not valid.
     valid (B, R): there is an object, and it is present.
     alive (B, P): the slot came into the frame with an object, whether or not it is still present.
-    propagated: beliefs about the P slots.
+    propagated: beliefs about the P slots; without the prior until all frames are stacked.
     discovery_prob, discovery_prior, discovery_pres (B, D): q, p and sample of the presence of all D cells.
     source (B, P), carried (B, P), ids (B, P): what the slots hold after filtering, as in `slots.Carried`.
     """
@@ -97,7 +112,7 @@ class Step(NamedTuple):
     presence: Tensor
     valid: Bool[Tensor, "B R"]
     alive: Bool[Tensor, "B P"]
-    propagated: Beliefs
+    propagated: Beliefs | Posterior
     discovery_prob: Float[Tensor, "B D"]
     discovery_prior: Float[Tensor, "B D"]
     discovery_pres: Float[Tensor, "B D"]
