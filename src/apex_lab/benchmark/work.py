@@ -7,6 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from apex_lab.base.memory import keep_freed_memory
 from apex_lab.config.building import (
     build_clip_frames,
     build_lr_scale,
@@ -57,6 +58,8 @@ class Workload:
             median = torch.rand(3, *(self.model.input_size or (side, side)), generator=noise)
             self.model.initialise(Statistics(lambda: median))
         self.model.to(device)
+        if model is None:  # as training does; a twin is measured as plain PyTorch
+            keep_freed_memory()
         self.update = WeightUpdate(
             self.model,
             build_schedules(config),

@@ -15,6 +15,7 @@ from lightning.pytorch.strategies import DDPStrategy
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.interrupts import Interrupted
+from apex_lab.base.memory import keep_freed_memory
 from apex_lab.config.building import build_clip_frames, build_lr_scale, build_optimizer, build_schedules, build_weights
 from apex_lab.config.schema import Config
 from apex_lab.data import VideoSource, training_loader, whole_loader
@@ -71,6 +72,7 @@ def fit(
                 raise UserError(not_restored("the state of the optimizer", error)) from error
         return built
 
+    keep_freed_memory()
     update = WeightUpdate(
         model,
         build_schedules(config),

@@ -147,10 +147,10 @@ class Muon(Optimizer):
                 mean, square = torch.zeros_like(weight), torch.zeros_like(weight)
                 self.state[weight].update(updates=updates, mean=mean, square=square)
         grads = [cast(Tensor, weight.grad) for weight in weights]
-        updates, means, squares = ([self.state[w][key] for w in weights] for key in ("updates", "mean", "square"))
+        counts, means, squares = ([self.state[w][key] for w in weights] for key in ("updates", "mean", "square"))
         beta1, beta2 = group["beta1"], group["beta2"]
-        torch._foreach_add_(updates, 1)
-        made = torch.stack(updates)
+        torch._foreach_add_(counts, 1)
+        made = torch.stack(counts)
         torch._foreach_lerp_(means, grads, 1 - beta1)
         torch._foreach_lerp_(squares, torch._foreach_mul(grads, grads), 1 - beta2)
         spread = torch._foreach_div(squares, (1 - beta2**made).unbind())
@@ -159,4 +159,4 @@ class Muon(Optimizer):
         torch._foreach_mul_(spread, (1 - beta1**made).unbind())
         changes = torch._foreach_mul(means, group["lr"])
         torch._foreach_div_(changes, spread)
-        torch._foreach_sub_(weights, changes)
+        torch._foreach_sub_(list(weights), list(changes))

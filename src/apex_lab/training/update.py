@@ -18,7 +18,6 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from apex_lab.base.errors import UserError
-from apex_lab.base.memory import keep_freed_memory
 from apex_lab.inference.sizes import as_float, fitted
 from apex_lab.nn.noise import RankNoise, mixed
 from apex_lab.scene import Context, Scene, SceneModel
@@ -93,7 +92,6 @@ class WeightUpdate(nn.Module):
         self.latest: dict[str, Tensor] = {}
         self._graphs: dict[torch.Size, tuple[torch.cuda.CUDAGraph, Tensor, dict[str, Tensor]]] = {}
         self._made: dict[torch.Size, int] = {}
-        keep_freed_memory()
         if mode != "eager":
             model.compile()
 
