@@ -56,7 +56,7 @@ def test_learning_rates_are_set_before_each_update() -> None:
 
 def test_learning_rates_of_a_captured_step_are_tensors_written_in_place() -> None:
     made = update()
-    optimizer = remember_rates(torch.optim.SGD(named_parameters(made.model), lr=1e-3), capturable=True)
+    optimizer = remember_rates(torch.optim.SGD(named_parameters(made.model), lr=1e-3), captured=True)
     rate = optimizer.param_groups[0]["lr"]
     made.step = 10
     made.write(optimizer)

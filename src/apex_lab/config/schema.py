@@ -27,6 +27,7 @@ class TrainerPart(_Part):
     precision: Literal[32, "bf16-mixed"]
     compile: bool
     cuda_graph: bool = False
+    matmul_precision: Literal["highest", "high", "medium"] = "highest"
     max_steps: int = Field(ge=1)
     max_minutes: float | None = Field(default=None, gt=0)
     gradient_clip_norm: float | None = Field(gt=0)

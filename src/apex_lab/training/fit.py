@@ -192,5 +192,5 @@ def resume_at(trainer: L.Trainer, step: int) -> None:
 def mode_of(config: Config, device: torch.device) -> Mode:
     """How weight updates are carried out."""
     if config.trainer.cuda_graph and device.type == "cuda":
-        return "cuda graph"
+        return "compiled cuda graph" if config.trainer.compile else "cuda graph"
     return "compiled" if config.trainer.compile else "eager"
