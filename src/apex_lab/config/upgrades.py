@@ -47,6 +47,7 @@ EXCLUDED = (
     "trainer.log_interval",
     "trainer.checkpoint_interval",
     "trainer.max_minutes",
+    "clips.on_device",
     "evaluation.pictures",
     "evaluation.batch_size",
     "evaluation.chunk",

@@ -103,6 +103,8 @@ def fit(
         ranks.rank,
         ranks.world,
         config.clips.starts,
+        trainer.strategy.root_device,
+        config.clips.on_device,
     )
     validation = whole_loader(
         source.sets["val"],
