@@ -270,8 +270,11 @@ def test_stopped_it_does_not_say_that_it_resumes(
 REFUSED = {
     "bench.repeats=0": "bench.repeats = 0 is wrong: input should be greater than or equal to 1.",
     "+bench.repeat=3": "Unknown key bench.repeat = 3; did you mean 'repeats'?",
-    "bench.modes=[fast]": "bench.modes.0 = 'fast' is wrong: input should be 'eager', 'compiled' or 'cuda graph'.",
+    "bench.modes=[fast]": "bench.modes.0 = 'fast' is wrong: input should be 'eager', 'compiled', 'cuda "
+    "graph' or 'compiled cuda graph'.",
     "bench.modes=[cuda graph]": "bench.modes holds 'cuda graph', but nothing is measured on a GPU: leave it out.",
+    "bench.modes=[compiled cuda graph]": "bench.modes holds 'compiled cuda graph', but nothing is measured on a GPU: "
+    "leave it out.",
     "bench=3": "bench = 3 is wrong: give bench.repeats=... and the like.",
     "bench.output=.": "bench.output = '.' is a folder: name a file.",
     "model=oracle": "model=oracle reads the ground truth: choose a model that looks at the video.",

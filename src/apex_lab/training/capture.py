@@ -15,6 +15,9 @@ from collections.abc import Callable, Iterator
 import torch
 from torch import Tensor
 
+from apex_lab.base.errors import UserError
+from apex_lab.base.validation import one_line
+
 Work = Callable[[Tensor], dict[str, Tensor]]
 
 
@@ -48,14 +51,24 @@ class Captured:
         work: input -> values; done once for capture, which changes no number.
         given: an input.
         side: where the work was warmed up.
+
+    Raises:
+        UserError: the work holds what a graph cannot.
     """
 
     def __init__(self, work: Work, given: Tensor, side: SideStream) -> None:
         self._given = given.clone()
         self._graph = torch.cuda.CUDAGraph()
         # other threads may use the device meanwhile, such as the one that pins the memory of batches
-        with torch.cuda.graph(self._graph, stream=side.stream, capture_error_mode="thread_local"):
-            self._values = work(self._given)
+        try:
+            with torch.cuda.graph(self._graph, stream=side.stream, capture_error_mode="thread_local"):
+                self._values = work(self._given)
+        except torch.OutOfMemoryError:
+            raise
+        except RuntimeError as error:
+            raise UserError(
+                f"This step cannot be captured as a CUDA graph ({one_line(error)}): set trainer.cuda_graph=false."
+            ) from error
 
     def __call__(self, given: Tensor) -> dict[str, Tensor]:
         """Does the work; its values stay until the next call."""

@@ -134,8 +134,7 @@ class Muon(Optimizer):
         momenta = [self.state[weight]["momentum"] for weight in weights]
         torch._foreach_lerp_(momenta, grads, 1 - group["momentum"])
         ahead = [x.flatten(1) for x in torch._foreach_lerp(grads, momenta, group["momentum"])]
-        # Neither bfloat16 carries the iteration (Lightning updates inside autocast where training is in half precision),
-        # nor does TF32: for a gradient of nearly one direction the result would be another one
+        # neither bfloat16 nor TF32 carries the iteration: of a gradient of nearly one direction they make another matrix
         device = weights[0].device
         with torch.autocast(device.type, enabled=False), full_products(device):
             changes = all_orthogonalised(ahead, group["iterations"])

@@ -185,11 +185,13 @@ class WeightUpdate(nn.Module):
                 frames = fitted(as_float(video), self.model.input_size)
                 scene: Scene = self.model(frames, Context(self.schedules.tensors(), noise))
             loss = self.objective(scene.terms)
-        with torch.profiler.record_function("backward"):
-            backward(loss)
-        with torch.profiler.record_function("update"):
-            norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.clip_norm)
-            step()
+        # Lightning makes the step inside autocast too, which is meant for the forward pass alone
+        with torch.autocast(video.device.type, enabled=False):
+            with torch.profiler.record_function("backward"):
+                backward(loss)
+            with torch.profiler.record_function("update"):
+                norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.clip_norm)
+                step()
         return {
             "train/loss": loss.detach(),
             **{f"train/{name}": term.detach().mean() for name, term in scene.terms.items()},
