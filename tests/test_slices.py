@@ -1,4 +1,4 @@
-"""A run from nothing to its row in a table, in slices of time, each a command of its own: as where nothing runs long."""
+"""A run from nothing to its row in a table, in slices of time, each a command of its own."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Numbered(VideoSet):
 class Source(VideoSource):
     """Nothing to prepare."""
 
-    sets: Mapping[str, VideoSet] = {"train": Numbered()}  # noqa: RUF012
+    sets: Mapping[str, VideoSet] = {"train": Numbered()}
     fingerprint = ""
 
     def prepare(self) -> None: ...

@@ -109,7 +109,9 @@ def traced(work: Callable[[], object]) -> list[tuple[str, tuple[Any, ...]]]:
     recorder = Recorder()
     with NoCopies(), recorder:
         work()
-    return [(str(func), tuple(_told(x) for x in tree_leaves((args, kwargs)))) for func, args, kwargs, _ in recorder.done]
+    return [
+        (str(func), tuple(_told(x) for x in tree_leaves((args, kwargs)))) for func, args, kwargs, _ in recorder.done
+    ]
 
 
 def _told(value: Any) -> Any:

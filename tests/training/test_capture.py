@@ -107,7 +107,9 @@ def test_a_learning_rate_that_is_no_tensor_would_be_noticed() -> None:
     assert layers("cuda graph", captured=False) != pytest.approx(layers("eager", captured=False), rel=1e-5)
 
 
-@pytest.mark.parametrize("words", [MUON, pytest.param(("trainer.precision=bf16-mixed",), marks=pytest.mark.slow)], ids=["Muon", "Adam, bf16"])
+@pytest.mark.parametrize(
+    "words", [MUON, pytest.param(("trainer.precision=bf16-mixed",), marks=pytest.mark.slow)], ids=["Muon", "Adam, bf16"]
+)
 @pytest.mark.usefixtures("as_on_a_gpu")
 def test_the_step_is_the_same_whatever_it_sees(words: tuple[str, ...]) -> None:
     """Other clips, noise and schedules, frames without any object: the same operations on the same shapes."""

@@ -12,9 +12,10 @@ from torch import Tensor, nn
 from torch.optim import SGD, Adam, Optimizer, RMSprop
 
 from apex_lab.config.upgrades import fingerprint
+from apex_lab.nn.precision import full_products
 from apex_lab.runs import provenance
 from apex_lab.training.composite import Composite
-from apex_lab.training.devices import _fused, full_products, set_matmul_precision
+from apex_lab.training.devices import _fused, set_matmul_precision
 from apex_lab.training.optimizers import Muon, all_orthogonalised
 from apex_lab.training.update import remember_rates
 from tests.conftest import compose_job

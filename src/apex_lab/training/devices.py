@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any, Literal
 
 import torch
@@ -24,20 +22,6 @@ def set_matmul_precision(device: torch.device, precision: MatmulPrecision) -> No
     """
     if device.type == "cuda":
         torch.set_float32_matmul_precision(precision)
-
-
-@contextlib.contextmanager
-def full_products(device: torch.device) -> Iterator[None]:
-    """Inside, float32 matrices are multiplied in float32, whatever `set_matmul_precision` allows."""
-    before = torch.get_float32_matmul_precision() if device.type == "cuda" else "highest"
-    if before == "highest":
-        yield
-        return
-    torch.set_float32_matmul_precision("highest")
-    try:
-        yield
-    finally:
-        torch.set_float32_matmul_precision(before)
 
 
 def adapt(optimizer: Optimizer, captured: bool) -> None:

@@ -15,7 +15,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from apex_lab.training.devices import full_products
+from apex_lab.nn.precision import full_products
 
 Positive = Annotated[float, Field(gt=0)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
@@ -134,7 +134,7 @@ class Muon(Optimizer):
         momenta = [self.state[weight]["momentum"] for weight in weights]
         torch._foreach_lerp_(momenta, grads, 1 - group["momentum"])
         ahead = [x.flatten(1) for x in torch._foreach_lerp(grads, momenta, group["momentum"])]
-        # neither bfloat16 nor TF32 carries the iteration: of a gradient of nearly one direction they make another matrix
+        # neither bfloat16 nor TF32 carries the iteration: of nearly one direction they make another matrix
         device = weights[0].device
         with torch.autocast(device.type, enabled=False), full_products(device):
             changes = all_orthogonalised(ahead, group["iterations"])

@@ -1,8 +1,8 @@
 """The step: one weight update, the same object in training and in the benchmark.
 
 Forward, weighted sum of the loss terms, backward, clipping, optimiser, learning-rate schedule; eager or compiled, and
-either of them captured as a CUDA graph. Everything that depends on progress (schedules, loss weights, learning rate) lies in tensors
-that are written in place before each update, so a captured graph sees the changes.
+either of them captured as a CUDA graph. Everything that depends on progress (schedules, loss weights, learning rate)
+lies in tensors that are written in place before each update, so a captured graph sees the changes.
 """
 
 from __future__ import annotations
