@@ -89,6 +89,20 @@ def test_half_precision_stays_close() -> None:
     assert half != full
 
 
+def test_backward_and_update_are_outside_autocast() -> None:
+    """Lightning opens it around the whole step."""
+    made, seen = update(precision="bf16-mixed"), []
+
+    def backward(loss: torch.Tensor) -> None:
+        seen.append(torch.is_autocast_enabled("cpu"))
+        loss.backward()
+
+    optimizer = remember_rates(torch.optim.SGD(named_parameters(made.model), lr=0.0))
+    with torch.autocast("cpu", torch.bfloat16):
+        made(batch(0), optimizer, backward=backward, update=lambda: seen.append(torch.is_autocast_enabled("cpu")))
+    assert seen == [False, False]
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_captured_step_trains_as_an_eager_one() -> None:

@@ -75,6 +75,8 @@ def measure(case: Case) -> dict[str, Any]:
     except TorchDynamoException as error:
         # PyTorch's own compiler could not do it here (no C++ compiler, no Triton): that is this row's result
         return {**row, "unavailable": f"cannot be compiled here: {_reason(error)}"}
+    except torch.OutOfMemoryError:
+        return {**row, "unavailable": "the GPU's memory does not hold it"}
     row |= spread(seconds, work.frames)
     row["setup_seconds"] = time.perf_counter() - began - sum(seconds)
     row["peak_memory_gib"] = peak_memory(device)
