@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.utils.data import DataLoader
 
 from apex_lab.data import Clip, ClipSampler, VideoSet, VideoSource
 from apex_lab.data.clips import Starts
 from apex_lab.data.loaders import training_loader
 from apex_lab.data.resident import Resident, size, worth_it
+from tests.conftest import TINY, train_in
+from tests.test_train import equal
 
 
 class Numbered(VideoSet):
@@ -81,6 +85,25 @@ def test_they_lie_on_a_gpu_where_they_fit(monkeypatch: pytest.MonkeyPatch) -> No
     assert not worth_it(videos, many, gpu, 0.24)
     assert not worth_it(videos, few, gpu, 1.0)
     assert not worth_it(videos, many, torch.device("cpu"), 1.0)
+
+
+def test_a_run_on_them_is_that_of_a_loader(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Through Lightning, with validation and a stop on the way."""
+    words = (*TINY, "trainer=cpu", "trainer.max_steps=7", "trainer.validation_interval=3")
+    train_in(tmp_path, *words)
+    monkeypatch.setattr("apex_lab.data.loaders.worth_it", lambda *_: True)
+    monkeypatch.setattr(DataLoader, "__init__", _only_whole(DataLoader.__init__))
+    train_in(tmp_path, *words, "paths.outputs=kept", "trainer.max_minutes=1e-6")
+    train_in(tmp_path, *words, "paths.outputs=kept")
+    equal(*(next((tmp_path / name).glob("*/seed_0")) for name in ("outputs", "kept")))
+
+
+def _only_whole(real: Callable[..., None]) -> Callable[..., None]:
+    def made(loader: Any, *args: Any, **kwargs: Any) -> None:
+        assert "batch_sampler" not in kwargs, "clips are loaded step by step"
+        real(loader, *args, **kwargs)
+
+    return made
 
 
 @pytest.mark.gpu

@@ -67,11 +67,7 @@ def rows(made: Workload, steps: int) -> list[dict[str, float]]:
 
 @pytest.mark.parametrize(
     ("words", "tolerance"),
-    [
-        ((), 1e-4),
-        pytest.param(MUON, 1e-4, marks=pytest.mark.slow),
-        pytest.param(("trainer.precision=bf16-mixed",), 2e-3, marks=pytest.mark.slow),
-    ],
+    [((), 1e-4), (MUON, 1e-4), (("trainer.precision=bf16-mixed",), 2e-3)],
     ids=["Adam", "Muon", "bf16"],
 )
 @pytest.mark.usefixtures("replayed", "as_on_a_gpu")
@@ -87,8 +83,7 @@ def layers(mode: Mode, captured: bool) -> list[float]:
     torch.manual_seed(5)
     schedules, weights = {"noise": Linear(1.0, 0.1, 10)}, {"error": Constant(1.0), "spread": Linear(0.0, 1.5, 10)}
     made = WeightUpdate(Layers(), schedules, weights, Linear(1.0, 0.1, 10), 1.0, seed=3, mode=mode)
-    rmsprop = torch.optim.RMSprop(named_parameters(made.model), lr=1e-2, foreach=True)  # as on a GPU by default
-    optimizer = remember_rates(rmsprop, captured)
+    optimizer = remember_rates(torch.optim.RMSprop(named_parameters(made.model), lr=1e-2), captured)
     found = []
     for step in range(20):
         shape = (4, 2, 3, 16, 16 if step < 12 else 12)  # a second graph
@@ -107,34 +102,65 @@ def test_a_learning_rate_that_is_no_tensor_would_be_noticed() -> None:
     assert layers("cuda graph", captured=False) != pytest.approx(layers("eager", captured=False), rel=1e-5)
 
 
-@pytest.mark.parametrize(
-    "words", [MUON, pytest.param(("trainer.precision=bf16-mixed",), marks=pytest.mark.slow)], ids=["Muon", "Adam, bf16"]
-)
-@pytest.mark.usefixtures("as_on_a_gpu")
-def test_the_step_is_the_same_whatever_it_sees(words: tuple[str, ...]) -> None:
-    """Other clips, noise and schedules, frames without any object: the same operations on the same shapes."""
-    made = workload(*words, mode="cuda graph")
-    optimizer = made.optimizer
+def always_the_same(made: Workload) -> int:
+    """Other clips, noise and schedules, frames without any object: the same operations on the same shapes.
+
+    Returns:
+        How many operations.
+    """
+    update, optimizer = made.update, made.optimizer
     assert optimizer is not None
-    made.model.train()
-    made.update(made.video, optimizer)  # makes the optimiser's state
+    places = [tensor.data_ptr() for tensor in update.schedules.tensors().values()]
 
     def step(video: Tensor, number: int) -> list[Any]:
-        update = made.update
         update.step = number
         update.write(optimizer)
         torch.manual_seed(number)
         noise = updates.RankNoise(len(video), 0, len(video))
-        places = [tensor.data_ptr() for tensor in update.schedules.tensors().values()]
-        assert places == first
+        assert [tensor.data_ptr() for tensor in update.schedules.tensors().values()] == places
         return traced(lambda: update._work(video, optimizer, noise, Tensor.backward, optimizer.step))
 
-    first = [tensor.data_ptr() for tensor in made.update.schedules.tensors().values()]
     with torch.random.fork_rng(devices=[]):
+        made.train()  # makes the optimiser's state
         expected = step(made.video, 1)
-        assert len(expected) > 2000
         for number, video in ((2, clips(made.video, 0)), (40, torch.full_like(made.video, 128))):
             assert step(video, number) == expected
+    return len(expected)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        MUON,
+        ("trainer.precision=bf16-mixed",),
+        pytest.param(("+ablation=image_stn",), marks=pytest.mark.slow),
+        pytest.param(("+ablation=gaussian_scalor_norm",), marks=pytest.mark.slow),
+    ],
+    ids=["Muon", "bf16", "image_stn", "gaussian_scalor_norm"],
+)
+@pytest.mark.usefixtures("as_on_a_gpu")
+def test_the_step_is_the_same_whatever_it_sees(words: tuple[str, ...]) -> None:
+    assert always_the_same(workload(*words, mode="cuda graph")) > 2000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["space", "scalor", "gswm", "slot_attention", "op3"])
+@pytest.mark.usefixtures("as_on_a_gpu")
+def test_the_step_of_other_models_too(model: str) -> None:
+    config = compose_job(f"model={model}", "data=sprites", "scale=smoke", "trainer=cpu").config
+    assert always_the_same(Workload(config, torch.device("cpu"), 2, 3, mode="cuda graph")) > 500
+
+
+@pytest.mark.usefixtures("as_on_a_gpu")
+def test_inference_is_the_same_whatever_it_sees() -> None:
+    made = workload()
+
+    def infer(video: Tensor) -> list[Any]:
+        return traced(lambda: made.predictor({"video": video, "name": ["a video"]}))
+
+    expected = infer(made.video)
+    assert len(expected) > 500
+    assert infer(torch.full_like(made.video, 128)) == expected
 
 
 @pytest.mark.parametrize("waits", [lambda x: x.sum().item(), lambda x: x[x > 0], lambda x: torch.tensor(3.0) + x])

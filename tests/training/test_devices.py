@@ -116,13 +116,14 @@ def test_a_state_of_a_captured_run_goes_on_on_a_cpu(make: Callable[[list[nn.Para
     for one in [state] if "param_groups" in state else state.values():
         for group in one["param_groups"]:
             group["lr"] = torch.tensor(group["lr"])
-            group.update({key: True for key in ("capturable", "fused") if key in group})
+            group.update({key: True for key in ("capturable", "fused", "foreach") if key in group})
     second = [nn.Parameter(weight.detach().clone()) for weight in first]
     going_on = make(second)
     going_on.load_state_dict(state)
     remember_rates(going_on)
     assert all(type(group["lr"]) is float for group in going_on.param_groups)
-    assert not any(group.get("capturable") or group.get("fused") for group in going_on.param_groups)
+    for key in ("capturable", "fused", "foreach"):
+        assert not any(group.get(key) for group in going_on.param_groups), key
     steps(second, going_on, range(3, 6))
     for a, b in zip(whole, second, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7)

@@ -28,8 +28,8 @@ def adapt(optimizer: Optimizer, captured: bool) -> None:
     """Makes an optimiser fit its weights' device, wherever its state was made.
 
     On a GPU PyTorch's own optimisers are fused where they can be and nothing else was asked for, one kernel in place of
-    dozens; what is captured in a CUDA graph has its learning rates and its counts of updates on the device. A state
-    that was loaded brings the options of the device that it comes from; they are set again.
+    dozens; what is captured in a CUDA graph has its learning rates and its counts of updates on the device, and updates
+    all weights together. A state that was loaded brings the options of where it comes from; they are set again.
 
     Args:
         optimizer: with or without a state.
@@ -48,6 +48,10 @@ def _adapt_group(optimizer: Optimizer, group: dict[str, Any], captured: bool) ->
         group["capturable"] = captured or optimizer.defaults["capturable"]
     if "fused" in group:
         group["fused"] = _fused(optimizer, device)
+    if "foreach" in group:
+        asked = optimizer.defaults["foreach"]
+        # one weight at a time, RMSprop would read its learning rate
+        group["foreach"] = True if captured and asked is None and not group.get("fused") else asked
     counted_there = group.get("capturable") or group.get("fused")
     for weight in group["params"]:
         count = optimizer.state.get(weight, {}).get("step")
