@@ -28,8 +28,10 @@ from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.profile import REST, seconds_by_part
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.job import check_job
+from apex_lab.training import update as updates
 from apex_lab.training.optimizers import Muon
 from tests.conftest import TINY, Ended, compose_job
+from tests.training.replayed import Replayed
 
 APEX = ("model=apex", "data=p2d", "scale=smoke", "trainer=cpu")
 HERE = torch.device("cpu")
@@ -101,9 +103,10 @@ def test_nothing_in_the_training_step_waits_for_the_device(words: tuple[str, ...
     assert any(not torch.equal(a, b) for a, b in zip(before, work.model.parameters(), strict=True))
 
 
-def test_nothing_in_an_update_by_muon_waits_for_the_device() -> None:
+@pytest.mark.parametrize("captured", [False, True])
+def test_nothing_in_an_update_by_muon_waits_for_the_device(captured: bool) -> None:
     model = torch.nn.Sequential(torch.nn.Conv2d(3, 8, 3), torch.nn.Flatten(), torch.nn.Linear(32, 2))
-    optimizer = Muon(model.parameters())
+    optimizer = updates.remember_rates(Muon(model.parameters()), captured)
     model(torch.rand(5, 3, 4, 4)).square().sum().backward()
     optimizer.step()
     before = [p.detach().clone() for p in model.parameters()]
@@ -270,8 +273,11 @@ def test_stopped_it_does_not_say_that_it_resumes(
 REFUSED = {
     "bench.repeats=0": "bench.repeats = 0 is wrong: input should be greater than or equal to 1.",
     "+bench.repeat=3": "Unknown key bench.repeat = 3; did you mean 'repeats'?",
-    "bench.modes=[fast]": "bench.modes.0 = 'fast' is wrong: input should be 'eager', 'compiled' or 'cuda graph'.",
+    "bench.modes=[fast]": "bench.modes.0 = 'fast' is wrong: input should be 'eager', 'compiled', 'cuda "
+    "graph' or 'compiled cuda graph'.",
     "bench.modes=[cuda graph]": "bench.modes holds 'cuda graph', but nothing is measured on a GPU: leave it out.",
+    "bench.modes=[compiled cuda graph]": "bench.modes holds 'compiled cuda graph', but nothing is measured on a GPU: "
+    "leave it out.",
     "bench=3": "bench = 3 is wrong: give bench.repeats=... and the like.",
     "bench.output=.": "bench.output = '.' is a folder: name a file.",
     "model=oracle": "model=oracle reads the ground truth: choose a model that looks at the video.",
@@ -319,6 +325,37 @@ def test_what_cannot_be_compiled_is_said_in_its_row(monkeypatch: pytest.MonkeyPa
     row = measure(Case(compose_job(*APEX).config, "cpu", "compiled", True, 1, 2, 1, 1))
     assert "No working C++ compiler" in row["unavailable"]
     assert report.line(row).startswith("cpu, compiled, training step: cannot be compiled here: ")
+
+
+def test_what_does_not_fit_a_gpu_is_said_in_its_row(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise torch.OutOfMemoryError
+
+    monkeypatch.setattr(Workload, "train", refuse)
+    row = measure(Case(compose_job(*APEX).config, "cpu", "eager", True, 1, 2, 1, 1))
+    assert report.line(row) == "cpu, eager, training step: the GPU's memory does not hold it"
+    assert report.tables([row]) == []
+
+
+def test_the_measurement_of_a_graph_begins_after_its_capture(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the graph of tests/training/replayed.py; rows name how matrices are multiplied on a GPU."""
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+    monkeypatch.setattr(updates, "Captured", Replayed)
+    steps: list[bool] = []
+    real = Workload.train
+
+    def noted(work: Workload) -> None:
+        steps.append(bool(work.update._graphs))
+        real(work)
+
+    monkeypatch.setattr(Workload, "train", noted)
+    row = measure(Case(compose_job(*APEX).config, "cpu", "cuda graph", True, 1, 2, 1, 2))
+    assert steps == [False] * 4 + [True] * 3  # the fourth captures
+    assert "parts" not in row
+    assert "graph_breaks" not in row
+    assert report.name(row) == "cpu, cuda graph, training step"
+    row = {**row, "precision": "bf16-mixed", "matmul_precision": "high"}
+    assert report.name(row) == "cpu, cuda graph, bf16, matmul high, training step"
 
 
 def kill_this_process(_: object) -> None:

@@ -33,7 +33,7 @@ from apex_lab.config.job import Job, check_job
 from apex_lab.config.schema import Config
 from apex_lab.runs import provenance
 from apex_lab.runs.folder import group_name
-from apex_lab.training.update import Mode
+from apex_lab.training.update import CAPTURED, Mode
 
 
 class BenchPart(BaseModel):
@@ -109,12 +109,13 @@ def check_bench(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequ
     if asked.output is not None and Path(asked.output).is_dir():
         raise UserError(f"bench.output = {shown(asked.output)} is a folder: name a file.")
     modes = _modes(asked, job)
+    named = next((mode for mode in modes if mode in CAPTURED and asked.modes is not None), None)
     if not model.capturable:
-        if asked.modes is not None and "cuda graph" in modes:
-            raise UserError("bench.modes holds 'cuda graph', and this model's steps follow its schedule: leave it out.")
-        modes = tuple(mode for mode in modes if mode != "cuda graph")
-    if "cuda graph" in modes and asked.modes is not None and device_of(job.config.trainer.accelerator).type == "cpu":
-        raise UserError("bench.modes holds 'cuda graph', but nothing is measured on a GPU: leave it out.")
+        if named is not None:
+            raise UserError(f"bench.modes holds '{named}', and this model's steps follow its schedule: leave it out.")
+        modes = tuple(mode for mode in modes if mode not in CAPTURED)
+    if named is not None and device_of(job.config.trainer.accelerator).type == "cpu":
+        raise UserError(f"bench.modes holds '{named}', but nothing is measured on a GPU: leave it out.")
     return Bench(job, asked, modes)
 
 
@@ -123,8 +124,8 @@ def _modes(asked: BenchPart, job: Job) -> tuple[Mode, ...]:
     if asked.modes is not None:
         return tuple(dict.fromkeys(asked.modes))
     if any(word.lstrip("+").startswith("trainer.compile=") for word in job.overrides):
-        return ("compiled", "cuda graph") if job.config.trainer.compile else ("eager",)
-    return ("eager", "compiled", "cuda graph")
+        return ("compiled", "compiled cuda graph") if job.config.trainer.compile else ("eager", "cuda graph")
+    return ("eager", "compiled", *CAPTURED)
 
 
 def bench(asked: Bench) -> None:
@@ -186,9 +187,11 @@ def _cases(asked: Bench, devices: Sequence[str]) -> Iterator[Case]:
         twice = device == "cuda" and config.trainer.precision == 32
         for settings in (config, half) if twice else (config,):
             for mode in asked.modes:
-                if mode == "cuda graph" and device == "cpu":
+                if mode in CAPTURED and device == "cpu":
                     continue
                 for training in (True, False) if trains else (False,):
+                    if mode in CAPTURED and not training:
+                        continue
                     batch = asked.batch(device, mode)
                     yield Case(settings, device, mode, training, *batch, asked.asked.warmup, asked.asked.repeats)
 

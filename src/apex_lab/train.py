@@ -42,6 +42,7 @@ from apex_lab.scene import SceneModel, Statistics, schedule_at
 from apex_lab.training import callbacks as own_callbacks
 from apex_lab.training import estimate, longer, ranks, worker
 from apex_lab.training.callbacks import Pruned
+from apex_lab.training.devices import set_matmul_precision
 from apex_lab.training.estimate import try_out
 from apex_lab.training.fit import fit
 from apex_lab.training.learner import Diverged
@@ -98,6 +99,7 @@ def train(job: Job, callbacks: Sequence[L.Callback] = (), command: str | None = 
             _show(run)
             return "finished"
         device = device_of(job.config.trainer.accelerator)
+        set_matmul_precision(device, job.config.trainer.matmul_precision)
         run.start(command or cli.command_line(), device)
         with beating(run.folder), console.log_to(run.folder / "log.txt"):
             try:

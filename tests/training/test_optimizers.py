@@ -8,10 +8,12 @@ import math
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from apex_lab.base.errors import UserError
 from apex_lab.config import components
 from apex_lab.training.optimizers import QUINTIC, Muon, all_orthogonalised, is_matrix, orthogonalised
+from apex_lab.training.update import remember_rates
 
 
 def test_orthogonalised_keeps_singular_vectors_and_maps_singular_values_by_the_quintic() -> None:
@@ -142,7 +144,7 @@ def small(seed: int = 0) -> nn.Module:
     return nn.Sequential(nn.Conv2d(3, 8, 3), nn.GroupNorm(2, 8), nn.ReLU(), nn.Flatten(), nn.Linear(8 * 4, 2))
 
 
-def descend(model: nn.Module, optimizer: Muon, steps: range) -> list[float]:
+def descend(model: nn.Module, optimizer: Optimizer, steps: range) -> list[float]:
     losses = []
     for i in steps:
         x = torch.randn(16, 3, 4, 4, generator=torch.Generator().manual_seed(i))
@@ -195,6 +197,14 @@ def test_a_closure_is_called_with_gradients_on() -> None:
 
     assert optimizer.step(closure).item() == 3
     assert weight.lt(1).all()
+
+
+def test_a_learning_rate_on_the_device_makes_the_same_steps() -> None:
+    number, tensor = small(), small()
+    descend(number, Muon(number.parameters()), range(4))
+    descend(tensor, remember_rates(Muon(tensor.parameters()), captured=True), range(4))
+    for x, y in zip(number.parameters(), tensor.parameters(), strict=True):
+        torch.testing.assert_close(x, y, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.gpu

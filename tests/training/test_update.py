@@ -56,7 +56,7 @@ def test_learning_rates_are_set_before_each_update() -> None:
 
 def test_learning_rates_of_a_captured_step_are_tensors_written_in_place() -> None:
     made = update()
-    optimizer = remember_rates(torch.optim.SGD(named_parameters(made.model), lr=1e-3), capturable=True)
+    optimizer = remember_rates(torch.optim.SGD(named_parameters(made.model), lr=1e-3), captured=True)
     rate = optimizer.param_groups[0]["lr"]
     made.step = 10
     made.write(optimizer)
@@ -87,6 +87,20 @@ def test_half_precision_stays_close() -> None:
     full, half = losses(update(), 5), losses(update(precision="bf16-mixed"), 5)
     assert half == pytest.approx(full, rel=0.02)
     assert half != full
+
+
+def test_backward_and_update_are_outside_autocast() -> None:
+    """Lightning opens it around the whole step."""
+    made, seen = update(precision="bf16-mixed"), []
+
+    def backward(loss: torch.Tensor) -> None:
+        seen.append(torch.is_autocast_enabled("cpu"))
+        loss.backward()
+
+    optimizer = remember_rates(torch.optim.SGD(named_parameters(made.model), lr=0.0))
+    with torch.autocast("cpu", torch.bfloat16):
+        made(batch(0), optimizer, backward=backward, update=lambda: seen.append(torch.is_autocast_enabled("cpu")))
+    assert seen == [False, False]
 
 
 @pytest.mark.gpu

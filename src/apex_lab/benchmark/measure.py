@@ -19,7 +19,7 @@ from apex_lab.benchmark.arithmetic import shares
 from apex_lab.benchmark.profile import seconds_by_part
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.schema import Config
-from apex_lab.training.update import Mode
+from apex_lab.training.update import CAPTURED, WARMUP, Mode
 
 GIB = 2**30
 
@@ -31,10 +31,10 @@ class Case:
     Attributes:
         config: of the run; its precision is that of the row.
         device: "cpu" or "cuda".
-        mode: `compiled` is `model.compile()`; `cuda graph` captures the whole step besides.
+        mode: as of `WeightUpdate`; a CUDA graph holds a training step.
         training: a training step, or an inference.
         batch_size, frames: of the batch.
-        warmup, repeats: steps before and during the measurement.
+        warmup, repeats: steps before and during the measurement; those before a capture, and with it, come on top.
         by_part: seconds by part too, which takes as many steps again.
     """
 
@@ -58,6 +58,7 @@ def measure(case: Case) -> dict[str, Any]:
         "device": case.device,
         "mode": case.mode,
         "precision": str(case.config.trainer.precision),
+        "matmul_precision": case.config.trainer.matmul_precision if device.type == "cuda" else None,
         "what": "training step" if case.training else "inference",
         "batch_size": case.batch_size,
         "frames": case.frames,
@@ -65,23 +66,25 @@ def measure(case: Case) -> dict[str, Any]:
         "repeats": case.repeats,
         "unavailable": None,
     }
-    step = work.step(case.training)
+    step, captured = work.step(case.training), case.mode in CAPTURED
     counters.clear()
     began = time.perf_counter()
     try:
         with torch.random.fork_rng(devices=[]):
-            seconds = timed(step, device, case.warmup, case.repeats)
+            seconds = timed(step, device, case.warmup + (WARMUP + 1 if captured else 0), case.repeats)
     except TorchDynamoException as error:
         # PyTorch's own compiler could not do it here (no C++ compiler, no Triton): that is this row's result
         return {**row, "unavailable": f"cannot be compiled here: {_reason(error)}"}
+    except torch.OutOfMemoryError:
+        return {**row, "unavailable": "the GPU's memory does not hold it"}
     row |= spread(seconds, work.frames)
     row["setup_seconds"] = time.perf_counter() - began - sum(seconds)
     row["peak_memory_gib"] = peak_memory(device)
     row["memory_before_gib"] = before
-    if case.mode != "eager":
+    if case.mode.startswith("compiled"):
         row["graph_breaks"] = sum(counters["graph_break"].values())
         row["graphs"] = counters["stats"]["unique_graphs"]
-    elif case.by_part:
+    elif case.by_part and not captured:
         row["parts"] = parts(work, case)
         row["arithmetic"] = shares(step, device, row["parts"])
     if device.type == "cuda":

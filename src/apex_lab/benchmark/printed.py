@@ -17,7 +17,8 @@ def about(hardware: Row, versions: Row) -> str:
 def name(row: Row) -> str:
     """What a row measures."""
     precision = "" if row["precision"] == "32" else ", bf16"
-    return f"{row['device']}, {row['mode']}{precision}, {row['what']}"
+    products = "" if row.get("matmul_precision") in (None, "highest") else f", matmul {row['matmul_precision']}"
+    return f"{row['device']}, {row['mode']}{precision}{products}, {row['what']}"
 
 
 def line(row: Row) -> str:

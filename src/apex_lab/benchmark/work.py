@@ -20,6 +20,7 @@ from apex_lab.config.schema import Config
 from apex_lab.data import Clip, Sprites
 from apex_lab.inference.predictor import Predictor
 from apex_lab.scene import SceneModel, Statistics
+from apex_lab.training.devices import set_matmul_precision
 from apex_lab.training.update import Mode, WeightUpdate, named_parameters, remember_rates
 
 COUNTS = (2, 4)
@@ -58,6 +59,7 @@ class Workload:
             median = torch.rand(3, *(self.model.input_size or (side, side)), generator=noise)
             self.model.initialise(Statistics(lambda: median))
         self.model.to(device)
+        set_matmul_precision(device, config.trainer.matmul_precision)
         if model is None:  # as training does; a twin is measured as plain PyTorch
             keep_freed_memory()
         self.update = WeightUpdate(
@@ -73,7 +75,7 @@ class Workload:
         ).to(device)
         self.update.write()
         self.optimizer = (
-            remember_rates(build_optimizer(config, named_parameters(self.model)), mode == "cuda graph")
+            remember_rates(build_optimizer(config, named_parameters(self.model)), self.update.captured)
             if self.model.needs_training
             else None
         )

@@ -27,6 +27,7 @@ class TrainerPart(_Part):
     precision: Literal[32, "bf16-mixed"]
     compile: bool
     cuda_graph: bool = False
+    matmul_precision: Literal["highest", "high", "medium"] = "highest"
     max_steps: int = Field(ge=1)
     max_minutes: float | None = Field(default=None, gt=0)
     gradient_clip_norm: float | None = Field(gt=0)
@@ -45,11 +46,13 @@ class ClipsPart(_Part):
         batch_size: clips of the global batch.
         frames: of a clip: null for whole videos, a number, or a schedule.
         starts: of clips that are shorter than their videos: `random`, or `disjoint`, pieces one after the other.
+        on_device: share of a GPU's free memory that the training videos may take; in it they are kept there.
     """
 
     batch_size: int = Field(ge=1)
     frames: int | dict[str, Any] | None = None
     starts: Literal["random", "disjoint"] = "random"
+    on_device: float = Field(default=0.25, ge=0, le=1)
 
 
 class EvaluationPart(_Part):

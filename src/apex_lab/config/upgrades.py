@@ -18,6 +18,7 @@ FORMAT = 2
 
 ADDED: dict[str, Any] = {
     "trainer.cuda_graph": False,
+    "trainer.matmul_precision": "highest",
     "init_from": None,
     "model.motion.bounded": False,  # G-SWM
     "model.unused_parameters": False,  # G-SWM
@@ -46,6 +47,7 @@ EXCLUDED = (
     "trainer.log_interval",
     "trainer.checkpoint_interval",
     "trainer.max_minutes",
+    "clips.on_device",
     "evaluation.pictures",
     "evaluation.batch_size",
     "evaluation.chunk",

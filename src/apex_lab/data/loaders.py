@@ -10,6 +10,7 @@ import torch
 from torch.utils.data import DataLoader, Subset
 
 from apex_lab.data.clips import ClipSampler, Frames, Starts, whole_videos
+from apex_lab.data.resident import Resident, worth_it
 from apex_lab.data.source import VideoSource
 from apex_lab.data.video_set import Item, VideoSet
 
@@ -26,11 +27,22 @@ def training_loader(
     rank: int = 0,
     ranks: int = 1,
     starts: Starts = "random",
-) -> Loader:
-    """One batch of training clips for each step from `start` up to `stop`; arguments as in `ClipSampler`."""
+    device: torch.device | None = None,
+    share: float = 0.0,
+) -> Loader | Resident:
+    """One batch of training clips for each step from `start` up to `stop`.
+
+    Args:
+        source: opened.
+        batch_size, seed, start, stop, frames, rank, ranks, starts: as in `ClipSampler`.
+        device: that trains; None: batches lie on the host.
+        share: of the device's free memory that the videos may take; see `apex_lab.data.resident.worth_it`.
+    """
     videos = source.sets["train"]
     lengths = [videos.length(i) for i in range(len(videos))]
     batches = ClipSampler(lengths, batch_size, seed, start, stop, frames, videos.views, rank, ranks, starts)
+    if device is not None and worth_it(videos, batches, device, share):
+        return Resident(videos, batches, device, **{**_options(source.workers), "persistent_workers": False})
     return DataLoader(videos, batch_sampler=batches, **_options(source.workers))
 
 

@@ -51,6 +51,7 @@ def hardware(device: Any) -> dict[str, Any]:
     if device.type == "cuda":
         about["gpu"] = torch.cuda.get_device_name(device)
         about["cuda"] = torch.version.cuda
+        about["matmul_precision"] = torch.get_float32_matmul_precision()
     return about
 
 

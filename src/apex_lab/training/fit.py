@@ -103,6 +103,8 @@ def fit(
         ranks.rank,
         ranks.world,
         config.clips.starts,
+        trainer.strategy.root_device,
+        config.clips.on_device,
     )
     validation = whole_loader(
         source.sets["val"],
@@ -192,5 +194,5 @@ def resume_at(trainer: L.Trainer, step: int) -> None:
 def mode_of(config: Config, device: torch.device) -> Mode:
     """How weight updates are carried out."""
     if config.trainer.cuda_graph and device.type == "cuda":
-        return "cuda graph"
+        return "compiled cuda graph" if config.trainer.compile else "cuda graph"
     return "compiled" if config.trainer.compile else "eager"

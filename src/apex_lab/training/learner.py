@@ -85,7 +85,7 @@ class Learner(L.LightningModule):
         return self.update.step
 
     def configure_optimizers(self) -> Optimizer:
-        return remember_rates(self._optimizer(named_parameters(self.update.model)), self.update.mode == "cuda graph")
+        return remember_rates(self._optimizer(named_parameters(self.update.model)), self.update.captured)
 
     def on_train_start(self) -> None:
         self._restart_clock()
@@ -105,6 +105,9 @@ class Learner(L.LightningModule):
         raw = self.raw_optimizer()
         step = self.step
         self.update(batch["video"], raw, self._rank, self._ranks, self.manual_backward, optimizer.step)
+        if self.update.captured:  # it has gone past Lightning, which counts updates too
+            counted = self.trainer.fit_loop.epoch_loop.manual_optimization.optim_step_progress.total
+            counted.ready = counted.completed = self.step
         self._frames += batch["video"].shape[0] * batch["video"].shape[1] * self._ranks
         self._refuse(self._watch.add(self.step, self.update.latest, batch))
         if self.step % self._log_interval == 0 or self.step == 1:

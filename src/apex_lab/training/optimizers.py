@@ -15,6 +15,8 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from apex_lab.nn.precision import full_products
+
 Positive = Annotated[float, Field(gt=0)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
 
@@ -132,12 +134,17 @@ class Muon(Optimizer):
         momenta = [self.state[weight]["momentum"] for weight in weights]
         torch._foreach_lerp_(momenta, grads, 1 - group["momentum"])
         ahead = [x.flatten(1) for x in torch._foreach_lerp(grads, momenta, group["momentum"])]
-        # Lightning updates inside autocast where training is in half precision: bfloat16 does not carry the iteration
-        with torch.autocast(weights[0].device.type, enabled=False):
+        # neither bfloat16 nor TF32 carries the iteration: of nearly one direction they make another matrix
+        device = weights[0].device
+        with torch.autocast(device.type, enabled=False), full_products(device):
             changes = all_orthogonalised(ahead, group["iterations"])
         for weight, change in zip(weights, changes, strict=True):
-            stretch = max(1.0, change.shape[0] / change.shape[1]) ** 0.5
-            weight.sub_(change.reshape(weight.shape), alpha=group["lr"] * stretch)
+            rate = group["lr"] * max(1.0, change.shape[0] / change.shape[1]) ** 0.5
+            change = change.reshape(weight.shape)
+            if isinstance(rate, Tensor):  # as a factor: an `alpha` would be read by the host
+                weight.sub_(change * rate)
+            else:
+                weight.sub_(change, alpha=rate)
 
     def _adam(self, weights: Sequence[Tensor], group: dict[str, Any]) -> None:
         for weight in weights:

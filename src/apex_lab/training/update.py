@@ -1,8 +1,8 @@
 """The step: one weight update, the same object in training and in the benchmark.
 
-Forward, weighted sum of the loss terms, backward, clipping, optimiser, learning-rate schedule; eager, compiled, or
-captured as a CUDA graph. Everything that depends on progress (schedules, loss weights, learning rate) lies in tensors
-that are written in place before each update, so a captured graph sees the changes.
+Forward, weighted sum of the loss terms, backward, clipping, optimiser, learning-rate schedule; eager or compiled, and
+either of them captured as a CUDA graph. Everything that depends on progress (schedules, loss weights, learning rate)
+lies in tensors that are written in place before each update, so a captured graph sees the changes.
 """
 
 from __future__ import annotations
@@ -21,12 +21,17 @@ from apex_lab.base.errors import UserError
 from apex_lab.inference.sizes import as_float, fitted
 from apex_lab.nn.noise import RankNoise, mixed
 from apex_lab.scene import Context, Scene, SceneModel
+from apex_lab.training.capture import Captured, SideStream
+from apex_lab.training.devices import adapt
 from apex_lab.training.schedules import Constant
 
 Values = Mapping[str, Callable[[int], float]]
 """Name -> schedule."""
 
-Mode = Literal["eager", "compiled", "cuda graph"]
+Mode = Literal["eager", "compiled", "cuda graph", "compiled cuda graph"]
+"""How a step is carried out: what a CUDA graph holds is eager or compiled."""
+
+CAPTURED: tuple[Mode, ...] = ("cuda graph", "compiled cuda graph")
 
 UNSCALED = Constant(1.0)
 WARMUP = 3
@@ -89,10 +94,12 @@ class WeightUpdate(nn.Module):
         self.terms = sorted(weights)
         self.lr_scale, self.seed, self.precision, self.step, self.mode = lr_scale, seed, precision, step, mode
         self.clip_norm = math.inf if clip_norm is None else clip_norm
+        self.captured = mode in CAPTURED
         self.latest: dict[str, Tensor] = {}
-        self._graphs: dict[torch.Size, tuple[torch.cuda.CUDAGraph, Tensor, dict[str, Tensor]]] = {}
+        self._graphs: dict[torch.Size, Captured] = {}
         self._made: dict[torch.Size, int] = {}
-        if mode != "eager":
+        self._side: SideStream | None = None
+        if mode.startswith("compiled"):
             model.compile()
 
     def objective(self, terms: Mapping[str, Float[Tensor, " B"]]) -> Float[Tensor, ""]:
@@ -104,8 +111,7 @@ class WeightUpdate(nn.Module):
         if sorted(terms) != self.terms:
             raise UserError(f"The model gives the loss terms {sorted(terms)}, loss has {self.terms}.")
         # a captured graph is the same at every step; elsewhere a weight of 0 takes its term out of the step
-        captured = self.mode == "cuda graph"
-        live = [name for name, weight in self.weights.schedules.items() if captured or weight(self.step) != 0]
+        live = [name for name, weight in self.weights.schedules.items() if self.captured or weight(self.step) != 0]
         return torch.stack([terms[name].mean() * self.weights[name] for name in live]).sum()
 
     def write(self, optimizer: Optimizer | None = None) -> None:
@@ -134,20 +140,35 @@ class WeightUpdate(nn.Module):
             video: this rank's clips, on the device.
             optimizer: over the model's parameters.
             rank, ranks: which share of the global batch this is.
-            backward: how gradients are computed (Lightning's `manual_backward` synchronises ranks).
-            update: how the optimiser's step is made; by default `optimizer.step()`.
+            backward: how gradients are computed (Lightning's `manual_backward` synchronises ranks); not used where the
+                step is captured, which is for one rank.
+            update: how the optimiser's step is made; by default `optimizer.step()`, as always where it is captured.
         """
         self.write(optimizer)
         torch.manual_seed(mixed(self.seed, self.step))
         noise = RankNoise(len(video), rank * len(video), ranks * len(video))
-        step = update or optimizer.step
-        if self.mode == "cuda graph" and self._made.get(video.shape, 0) >= WARMUP:
-            self._replay(video, optimizer, noise)
+        if self.captured:
+            self.latest = self._by_graph(video, optimizer, noise)
         else:
-            if self.mode == "cuda graph":
-                self._made[video.shape] = self._made.get(video.shape, 0) + 1
-            self.latest = self._work(video, optimizer, noise, backward, step)
+            self.latest = self._work(video, optimizer, noise, backward, update or optimizer.step)
         self.step += 1
+
+    def _by_graph(self, video: Tensor, optimizer: Optimizer, noise: RankNoise) -> dict[str, Tensor]:
+        """An update by the graph for videos of this shape; before there is one, by what it will hold."""
+
+        def work(clips: Tensor) -> dict[str, Tensor]:
+            return self._work(clips, optimizer, noise, Tensor.backward, optimizer.step)
+
+        self._side = self._side or SideStream(video.device)
+        made = self._made.get(video.shape, 0)
+        self._made[video.shape] = made + 1
+        if made < WARMUP:
+            with self._side.ordered():
+                return work(video)
+        if video.shape not in self._graphs:
+            optimizer.zero_grad(set_to_none=True)
+            self._graphs[video.shape] = Captured(work, video, self._side)
+        return self._graphs[video.shape](video)
 
     def _work(
         self,
@@ -164,11 +185,13 @@ class WeightUpdate(nn.Module):
                 frames = fitted(as_float(video), self.model.input_size)
                 scene: Scene = self.model(frames, Context(self.schedules.tensors(), noise))
             loss = self.objective(scene.terms)
-        with torch.profiler.record_function("backward"):
-            backward(loss)
-        with torch.profiler.record_function("update"):
-            norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.clip_norm)
-            step()
+        # Lightning makes the step inside autocast too, which is meant for the forward pass alone
+        with torch.autocast(video.device.type, enabled=False):
+            with torch.profiler.record_function("backward"):
+                backward(loss)
+            with torch.profiler.record_function("update"):
+                norm = nn.utils.clip_grad_norm_(self.model.parameters(), self.clip_norm)
+                step()
         return {
             "train/loss": loss.detach(),
             **{f"train/{name}": term.detach().mean() for name, term in scene.terms.items()},
@@ -181,24 +204,12 @@ class WeightUpdate(nn.Module):
         """The precision of the run; without PyTorch's cache of cast weights, which a graph must not capture."""
         device = self.schedules_device()
         half = self.precision == "bf16-mixed"
-        with torch.autocast(device.type, torch.bfloat16, enabled=half, cache_enabled=self.mode != "cuda graph"):
+        with torch.autocast(device.type, torch.bfloat16, enabled=half, cache_enabled=not self.captured):
             yield
 
     def schedules_device(self) -> torch.device:
         """Where the model is."""
         return next(self.model.parameters()).device
-
-    def _replay(self, video: Tensor, optimizer: Optimizer, noise: RankNoise) -> None:
-        """Replays the captured update for videos of this shape; captures it first where there is none."""
-        if video.shape not in self._graphs:
-            held = video.clone()
-            graph = torch.cuda.CUDAGraph()
-            with torch.cuda.graph(graph):
-                latest = self._work(held, optimizer, noise, Tensor.backward, optimizer.step)
-            self._graphs[video.shape] = (graph, held, latest)
-        graph, held, self.latest = self._graphs[video.shape]
-        held.copy_(video)
-        graph.replay()
 
 
 def named_parameters(model: nn.Module) -> list[tuple[str, nn.Parameter]]:
@@ -206,13 +217,9 @@ def named_parameters(model: nn.Module) -> list[tuple[str, nn.Parameter]]:
     return [(name, weight) for name, weight in model.named_parameters() if weight.requires_grad]
 
 
-def remember_rates(optimizer: Optimizer, capturable: bool = False) -> Optimizer:
-    """Notes each group's learning rate under the name of PyTorch's schedulers; as a tensor where it is captured."""
+def remember_rates(optimizer: Optimizer, captured: bool = False) -> Optimizer:
+    """Notes each group's learning rate under the name of PyTorch's schedulers, and fits the optimiser to its device."""
     for group in optimizer.param_groups:
         group.setdefault("initial_lr", float(group["lr"]))
-        if capturable:
-            device = group["params"][0].device
-            group["lr"] = torch.tensor(float(group["lr"]), device=device)
-            if "capturable" in group:
-                group["capturable"] = True
+    adapt(optimizer, captured)
     return optimizer

@@ -17,6 +17,7 @@ from apex_lab.base.interrupts import Interrupted
 from apex_lab.config import components, trust
 from apex_lab.config.building import build_model
 from apex_lab.config.schema import Config
+from apex_lab.training.devices import set_matmul_precision
 from apex_lab.training.fit import fit
 from apex_lab.training.ranks import JOB, Ranks, end_with_parent
 
@@ -57,7 +58,9 @@ def train_along(file: Path, ranks: Ranks, known: Iterable[str] | None = None) ->
     source = components.build(config.data, "data")
     source.open()
     callbacks = [components.build(node, f"callbacks.{name}") for name, node in config.callbacks.items()]
-    fit(config, model, source, torch.device(job["device"]), job["step"], job["training"], ranks, callbacks)
+    device = torch.device(job["device"])
+    set_matmul_precision(device, config.trainer.matmul_precision)
+    fit(config, model, source, device, job["step"], job["training"], ranks, callbacks)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,216 @@
+"""That the step can be captured as a CUDA graph, as far as a CPU can tell (`tests.training.replayed`).
+
+`torch.compiler.is_compiling` is made true, so that the code takes the way of a GPU.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+from apex_lab.benchmark.work import Workload
+from apex_lab.training import update as updates
+from apex_lab.training.schedules import Constant, Linear
+from apex_lab.training.update import WARMUP, Mode, WeightUpdate, named_parameters, remember_rates
+from tests.conftest import TINY, compose_job, train_in
+from tests.test_train import record, weights, without_speed
+from tests.tiny import Layers
+from tests.training.replayed import Refused, Replayed, traced
+
+APEX = ("model=apex", "data=p2d", "trainer=cpu", "scale=smoke")
+MOVING = tuple(
+    f"schedule.{name}={{_target_: apex_lab.training.schedules.Linear, start: {start}, end: {end}, steps: 20}}"
+    for name, start, end in (("temperature", 1.0, 0.5), ("carry", 0.3, 1.0), ("sigma_bg_scale", 1.5, 1.0))
+)
+"""Schedules that change at every step."""
+MUON = ("optimizer._target_=apex_lab.training.optimizers.Muon",)
+SCALED = ("lr_scale={_target_: apex_lab.training.schedules.Linear, start: 1.0, end: 0.5, steps: 20}",)
+
+
+@pytest.fixture
+def as_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.compiler, "is_compiling", lambda: True)
+
+
+@pytest.fixture
+def replayed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(updates, "Captured", Replayed)
+
+
+def workload(*words: str, mode: Mode = "eager") -> Workload:
+    made = Workload(compose_job(*APEX, *MOVING, *SCALED, *words).config, torch.device("cpu"), 1, 2, mode=mode)
+    made.update.step = 0
+    return made
+
+
+def clips(like: Tensor, step: int) -> Tensor:
+    return torch.randint(0, 256, like.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(step))
+
+
+def rows(made: Workload, steps: int) -> list[dict[str, float]]:
+    """Values of each step, on other clips at every other step."""
+    assert made.optimizer is not None
+    found = []
+    made.model.train()
+    with torch.random.fork_rng(devices=[]):
+        for step in range(steps):
+            made.update(clips(made.video, step) if step % 2 else made.video, made.optimizer)
+            found.append({name: value.item() for name, value in made.update.latest.items()})
+    return found
+
+
+@pytest.mark.parametrize(
+    ("words", "tolerance"),
+    [((), 1e-4), (MUON, 1e-4), (("trainer.precision=bf16-mixed",), 2e-3)],
+    ids=["Adam", "Muon", "bf16"],
+)
+@pytest.mark.usefixtures("replayed", "as_on_a_gpu")
+def test_a_replayed_step_of_apex_trains_as_an_eager_one(words: tuple[str, ...], tolerance: float) -> None:
+    steps = WARMUP + 2
+    eager, graph = workload(*words), workload(*words, mode="cuda graph")
+    for expected, found in zip(rows(eager, steps), rows(graph, steps), strict=True):
+        assert found == pytest.approx(expected, rel=tolerance)
+        assert found["train/loss"] == pytest.approx(expected["train/loss"], rel=tolerance / 100)
+
+
+def layers(mode: Mode, captured: bool) -> list[float]:
+    torch.manual_seed(5)
+    schedules, weights = {"noise": Linear(1.0, 0.1, 10)}, {"error": Constant(1.0), "spread": Linear(0.0, 1.5, 10)}
+    made = WeightUpdate(Layers(), schedules, weights, Linear(1.0, 0.1, 10), 1.0, seed=3, mode=mode)
+    optimizer = remember_rates(torch.optim.RMSprop(named_parameters(made.model), lr=1e-2), captured)
+    found = []
+    for step in range(20):
+        shape = (4, 2, 3, 16, 16 if step < 12 else 12)  # a second graph
+        made(clips(torch.empty(shape), step), optimizer)
+        found.append(made.latest["train/loss"].item())
+    return found
+
+
+@pytest.mark.usefixtures("replayed", "as_on_a_gpu")
+def test_twenty_steps_in_two_shapes() -> None:
+    assert layers("cuda graph", captured=True) == pytest.approx(layers("eager", captured=False), rel=1e-5)
+
+
+@pytest.mark.usefixtures("replayed", "as_on_a_gpu")
+def test_a_learning_rate_that_is_no_tensor_would_be_noticed() -> None:
+    assert layers("cuda graph", captured=False) != pytest.approx(layers("eager", captured=False), rel=1e-5)
+
+
+def always_the_same(made: Workload) -> int:
+    """Other clips, noise and schedules, frames without any object: the same operations on the same shapes.
+
+    Returns:
+        How many operations.
+    """
+    update, optimizer = made.update, made.optimizer
+    assert optimizer is not None
+    places = [tensor.data_ptr() for tensor in update.schedules.tensors().values()]
+
+    def step(video: Tensor, number: int) -> list[Any]:
+        update.step = number
+        update.write(optimizer)
+        torch.manual_seed(number)
+        noise = updates.RankNoise(len(video), 0, len(video))
+        assert [tensor.data_ptr() for tensor in update.schedules.tensors().values()] == places
+        return traced(lambda: update._work(video, optimizer, noise, Tensor.backward, optimizer.step))
+
+    with torch.random.fork_rng(devices=[]):
+        made.train()  # makes the optimiser's state
+        expected = step(made.video, 1)
+        for number, video in ((2, clips(made.video, 0)), (40, torch.full_like(made.video, 128))):
+            assert step(video, number) == expected
+    return len(expected)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        MUON,
+        ("trainer.precision=bf16-mixed",),
+        pytest.param(("+ablation=image_stn",), marks=pytest.mark.slow),
+        pytest.param(("+ablation=gaussian_scalor_norm",), marks=pytest.mark.slow),
+    ],
+    ids=["Muon", "bf16", "image_stn", "gaussian_scalor_norm"],
+)
+@pytest.mark.usefixtures("as_on_a_gpu")
+def test_the_step_is_the_same_whatever_it_sees(words: tuple[str, ...]) -> None:
+    assert always_the_same(workload(*words, mode="cuda graph")) > 2000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["space", "scalor", "gswm", "slot_attention", "op3"])
+@pytest.mark.usefixtures("as_on_a_gpu")
+def test_the_step_of_other_models_too(model: str) -> None:
+    config = compose_job(f"model={model}", "data=sprites", "scale=smoke", "trainer=cpu").config
+    assert always_the_same(Workload(config, torch.device("cpu"), 2, 3, mode="cuda graph")) > 500
+
+
+@pytest.mark.usefixtures("as_on_a_gpu")
+def test_inference_is_the_same_whatever_it_sees() -> None:
+    made = workload()
+
+    def infer(video: Tensor) -> list[Any]:
+        return traced(lambda: made.predictor({"video": video, "name": ["a video"]}))
+
+    expected = infer(made.video)
+    assert len(expected) > 500
+    assert infer(torch.full_like(made.video, 128)) == expected
+
+
+@pytest.mark.parametrize("waits", [lambda x: x.sum().item(), lambda x: x[x > 0], lambda x: torch.tensor(3.0) + x])
+def test_what_waits_for_the_device_is_refused(waits: Any) -> None:
+    with pytest.raises(Refused):
+        traced(lambda: waits(torch.ones(3)))
+
+
+class OnOneDevice(TorchDispatchMode):
+    """Raises where a tensor of the host comes into a computation on the device."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        results = func(*args, **(kwargs or {}))
+        for tensor in tree_leaves((args, kwargs, results)):
+            if isinstance(tensor, Tensor):
+                assert tensor.device.type == "meta", f"{func} of a tensor on the {tensor.device.type}"
+        return results
+
+
+@pytest.mark.parametrize("words", [(), MUON], ids=["Adam", "Muon"])
+@pytest.mark.usefixtures("as_on_a_gpu")
+def test_nothing_of_the_step_lies_on_the_host(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The device `meta` has shapes without numbers: whatever asks for a number raises."""
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # there is none for `meta`
+    config = compose_job(*APEX, *words).config
+    made = Workload(config, torch.device("meta"), 1, 2, mode="cuda graph")
+    assert made.optimizer is not None
+    made.model.train()
+    with OnOneDevice():
+        made.update(made.video, made.optimizer)
+    assert made.update.latest["train/loss"].device.type == "meta"
+    with pytest.raises(AssertionError, match="on the cpu"), OnOneDevice():
+        _ = made.video.float() * torch.ones(())
+
+
+@pytest.mark.usefixtures("replayed")
+def test_a_whole_run_by_graph(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    """Through Lightning, with validation and checkpoints between, and with a stop after the first steps."""
+    words = (*TINY, *MUON, "trainer=cpu", "trainer.max_steps=12", "trainer.validation_interval=5")
+    runs = []
+    for name in ("eager", "graph"):
+        if name == "graph":
+            monkeypatch.setattr("apex_lab.training.fit.mode_of", lambda *_: "cuda graph")
+            train_in(tmp_path, *words, f"paths.outputs={name}", "trainer.max_minutes=1e-6")  # one step
+        train_in(tmp_path, *words, f"paths.outputs={name}")
+        runs.append(next((tmp_path / name).glob("*/seed_0")))
+    assert [record(run)["steps"] for run in runs] == [12, 12]
+    for a, b in zip(*(weights(run).values() for run in runs), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-3, atol=1e-4)
+    for expected, found in zip(*map(without_speed, runs), strict=True):
+        assert {k: float(v) for k, v in found.items() if v} == pytest.approx(
+            {k: float(v) for k, v in expected.items() if v}, rel=1e-4, abs=1e-6
+        )
