@@ -146,6 +146,9 @@ class SceneModel(nn.Module):
     term_names: ClassVar[tuple[str, ...]] = ()
     """Names of the loss terms in `Scene.terms`."""
 
+    optional_terms: ClassVar[tuple[str, ...]] = ()
+    """Those of `term_names` that a configuration may leave out; their weight is 0 then."""
+
     schedule_ranges: ClassVar[Mapping[str, tuple[float, float]]] = {}
     """Scheduled values that `forward` reads: name -> smallest and largest allowed value."""
 

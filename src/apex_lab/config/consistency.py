@@ -105,7 +105,7 @@ def check_together(config: Config) -> None:
     for key, value in values.items():
         check_range(key, value, ranges[key], config.trainer.max_steps)
     _same_names("schedule", schedules, model.schedule_ranges, model.optional_schedules)
-    _same_names("loss", weights, model.term_names)
+    _same_names("loss", weights, model.term_names, model.optional_terms)
     if model.needs_training:
         _check_early_stopping(config, model, source.labelled)
         named = [(name, p) for name, p in model.named_parameters() if p.requires_grad]

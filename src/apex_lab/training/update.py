@@ -108,7 +108,8 @@ class WeightUpdate(nn.Module):
         Raises:
             UserError: the model gives other terms than those that the configuration weighs.
         """
-        if sorted(terms) != self.terms:
+        optional = set(self.model.optional_terms)
+        if set(terms) - optional != set(self.terms) - optional:
             raise UserError(f"The model gives the loss terms {sorted(terms)}, loss has {self.terms}.")
         # a captured graph is the same at every step; elsewhere a weight of 0 takes its term out of the step
         live = [name for name, weight in self.weights.schedules.items() if self.captured or weight(self.step) != 0]

@@ -7,7 +7,7 @@ import torch
 from torch.distributions import Bernoulli, Normal, kl_divergence
 
 from apex_lab.models.apex.masks import ApexNormalisation
-from apex_lab.models.apex.objective import DiscoveryPrior, kl_terms, mask_entropy
+from apex_lab.models.apex.objective import DiscoveryPrior, kl_terms, loose_windows, mask_entropy
 from apex_lab.models.apex.objects import Beliefs, Proposals, context_probability, scope_in_windows
 from apex_lab.models.apex.windows import Windows, square_of, window_of
 from apex_lab.nn.distributions import Gaussian
@@ -161,3 +161,67 @@ def test_a_centre_held_at_the_border_keeps_its_gradient() -> None:
     place[0, 2].backward()
     assert z.grad is not None
     assert z.grad[0, 2] > 0
+
+
+def block(size: int, top: int, bottom: int, left: int, right: int, value: float = 1.0) -> torch.Tensor:
+    mask = torch.zeros(size, size, dtype=torch.float64)
+    mask[top:bottom, left:right] = value
+    return mask
+
+
+def place_of(height: float, width: float, y: float, x: float) -> torch.Tensor:
+    size = torch.tensor([height, width], dtype=torch.float64).logit()
+    return torch.cat([size, torch.tensor([y, x], dtype=torch.float64)])
+
+
+def test_a_window_that_fits_its_block_of_pixels_is_not_loose() -> None:
+    # rows 4 to 12 and columns 8 to 24 of 32: shares 1/4 and 1/2 of the side, centres -1/2 and 0
+    masks, one = block(32, 4, 12, 8, 24)[None, None], torch.ones(1, 1, dtype=torch.float64)
+    fits = place_of(1.25 / 4, 1.25 / 2, -0.5, 0.0)
+    assert float(loose_windows(masks, fits[None, None], one)) == pytest.approx(0, abs=1e-12)
+    smaller = place_of(0.2, 0.2, -0.5, 0.0)
+    assert float(loose_windows(masks, smaller[None, None], one)) == pytest.approx(0, abs=1e-12)
+    loose = place_of(0.625, 0.9, -0.3, 0.25)
+    wanted = math.log(2) ** 2 + math.log(0.9 / 0.625) ** 2 + (0.2 / 0.625) ** 2 + (0.25 / 1.25) ** 2
+    assert float(loose_windows(masks, loose[None, None], one)) == pytest.approx(wanted, rel=1e-9)
+    assert float(loose_windows(masks, loose[None, None], 0.5 * one)) == pytest.approx(wanted / 2, rel=1e-9)
+
+
+def test_loose_windows_against_a_loop_over_pixels() -> None:
+    torch.manual_seed(4)
+    n, k, size = 2, 3, 16
+    masks = torch.rand(n, k, size, size).double()
+    place = torch.cat([torch.randn(n, k, 2), torch.rand(n, k, 2) * 2 - 1], -1).double()
+    presence = torch.rand(n, k).double()
+    masks[0, 1] = block(size, 3, 5, 3, 6)  # six pixels: too few to judge a window by
+    masks[1, 2] = block(size, 0, 9, 0, 9, 0.25)  # a smear
+    got = loose_windows(masks, place, presence, margin=1.5)
+    for i in range(n):
+        want = 0.0
+        for j in range(k):
+            seen = [(y, x, float(m)) for y, row in enumerate(masks[i, j]) for x, m in enumerate(row) if m > 0.3]
+            total = sum(m for *_, m in seen)
+            if total <= 8:
+                continue
+            for axis in (0, 1):
+                at = [((2 * pixel[axis] + 1) / size - 1, pixel[2]) for pixel in seen]
+                mean = sum(a * m for a, m in at) / total
+                variance = sum((a - mean) ** 2 * m for a, m in at) / total + 1 / (3 * size**2)
+                fit = min(max(1.5 * math.sqrt(3 * variance), 4 / size), 0.95)
+                share = 1 / (1 + math.exp(-float(place[i, j, axis])))
+                loose = max(0.0, math.log(share / fit)) ** 2 + ((float(place[i, j, 2 + axis]) - mean) / (2 * fit)) ** 2
+                want += float(presence[i, j]) * loose
+        assert float(got[i]) == pytest.approx(want, rel=1e-9)
+
+
+def test_loose_windows_move_windows_alone() -> None:
+    masks = block(16, 2, 8, 2, 8)[None, None].repeat(1, 2, 1, 1).requires_grad_()
+    presence = torch.tensor([[1.0, 0.0]], dtype=torch.float64, requires_grad=True)
+    place = torch.stack([place_of(0.8, 0.8, 0.1, 0.1)] * 2)[None].requires_grad_()
+    to_masks, to_presence, to_place = torch.autograd.grad(
+        loose_windows(masks, place, presence).sum(), (masks, presence, place), allow_unused=True
+    )
+    assert to_masks is None
+    assert to_presence is None
+    assert (to_place[0, 0] > 0).all()  # smaller, and up and left
+    assert (to_place[0, 1] == 0).all()  # absent

@@ -19,7 +19,7 @@ def test_values_of_the_paper() -> None:
     assert (config["clips"]["batch_size"], config["data"]["frames"], config["trainer"]["max_steps"]) == (4, 20, 40_000)
     assert config["clips"]["frames"] is None  # whole videos
     terms = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
-    assert config["loss"] == dict.fromkeys(terms, 1.0)  # the last one is lambda_H
+    assert config["loss"] == dict.fromkeys(terms, 1.0)  # the last one is lambda_H; loose_windows is not the paper's
 
 
 def test_schedules_at_the_paper_s_scale() -> None:

@@ -16,7 +16,7 @@ from apex_lab.models.apex.encoder import ApexEncoder
 from apex_lab.models.apex.glimpses import Glimpses
 from apex_lab.models.apex.likelihood import Likelihood, MixtureLikelihood
 from apex_lab.models.apex.masks import MaskNormalisation, Masks
-from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, mask_entropy
+from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, loose_windows, mask_entropy
 from apex_lab.models.apex.objects import (
     Appearance,
     Beliefs,
@@ -76,7 +76,8 @@ class Apex(SceneModel):
             before noise drowns them; under the inclusive KL it costs 1 / (2 std^2) nats per dimension and object.
     """
 
-    term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy")
+    term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy", "loose_windows")
+    optional_terms = ("loose_windows",)
     schedule_ranges: ClassVar = {
         "temperature": (0.01, 100.0),
         "discovery_presence": (0.0, 1.0),
@@ -374,6 +375,7 @@ class Apex(SceneModel):
             ),
             "kl_background": kl_background.sum(1),
             "mask_entropy": picture.mask_entropy.sum(1),
+            "loose_windows": picture.loose_windows.sum(1),
         }
         return scene_of(steps, picture, terms, context.detail, state_with(over_time[:, -1]))
 
@@ -399,6 +401,7 @@ class Apex(SceneModel):
             (masks.objects[:, :, None] * means).sum(1) + masks.background[:, None] * backdrop,
             log_likelihood,
             mask_entropy(masks),
+            loose_windows(masks.objects, part.place, part.presence * part.valid),
             backdrop,
             means if context.detail else None,
         )

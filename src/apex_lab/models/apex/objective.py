@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
@@ -88,3 +90,57 @@ def mask_entropy(masks: Masks) -> Float[Tensor, "..."]:
     # x log x -> 0: where a mask underflows (or is -inf, an absent component), its log is replaced before multiplying.
     log_objects = masks.log_objects.masked_fill(masks.log_objects < -60, 0.0)
     return -(masks.foreground * (masks.objects * log_objects).sum(-3)).sum((-2, -1))
+
+
+SEEN = 0.3
+"""A pixel belongs to what a window should fit where its mask is above this: faint smears stretch no window."""
+
+FEWEST = 8
+"""Pixels that a mask must cover before its window is judged by it."""
+
+
+def loose_windows(
+    masks: Float[Tensor, "N K H W"],
+    place: Float[Tensor, "N K 4"],
+    presence: Float[Tensor, "N K"],
+    margin: float = 1.25,
+) -> Float[Tensor, " N"]:
+    """How much larger windows are than their own masks, and how far off their centres. Not in the paper.
+
+    The likelihood alone does not shrink a window: what is drawn in a smaller one is worse until the decoders have
+    learned it. So all windows stay as large as they start, hold several things, and a small thing beside a large one is
+    proposed by no cell. Per component and axis, with s the window's size and t its centre, c the mean of the mask's
+    pixels and f = margin * sqrt(3) * their standard deviation, the size of a block of pixels with a margin:
+
+        max(0, log s - log f)^2 + ((t - c) / (2 f))^2
+
+    summed over both axes and all components, each as often as it is present. Masks and presence get no gradient.
+
+    Args:
+        masks: in [0, 1].
+        place: as in windows.py.
+        presence: in [0, 1]; zero for slots that hold nothing.
+        margin: room around the mask, of its size.
+    """
+    height, width = masks.shape[-2:]
+    seen = masks.detach() * (masks.detach() > SEEN)
+    rows = _mean_and_deviation(seen.sum(-1))
+    columns = _mean_and_deviation(seen.sum(-2))
+    centre, deviation = (torch.stack(pair, dim=-1) for pair in zip(rows, columns, strict=True))
+    smallest = 4 / max(height, width)  # a window smaller than a few pixels has next to no gradient
+    fit = (margin * math.sqrt(3) * deviation).clamp(smallest, 0.95)
+    size, middle = place.split(2, dim=-1)
+    too_large = (F.logsigmoid(size) - fit.log()).clamp_min(0).square()
+    off = ((middle - centre) / (2 * fit)).square()
+    judged = presence.detach() * (seen.sum((-2, -1)) > FEWEST)
+    return ((too_large + off).sum(-1) * judged).sum(-1)
+
+
+def _mean_and_deviation(profile: Float[Tensor, "... n"]) -> tuple[Float[Tensor, "..."], Float[Tensor, "..."]]:
+    """Of positions in [-1, 1], n pixels with these weights; each pixel is as wide as it is."""
+    n = profile.shape[-1]
+    at = (2 * torch.arange(n, device=profile.device, dtype=profile.dtype) + 1) / n - 1
+    share = profile / profile.sum(-1, keepdim=True).clamp_min(1e-6)
+    mean = share @ at
+    variance = (share * (at - mean[..., None]).square()).sum(-1) + 1 / (3 * n**2)
+    return mean, variance.sqrt()

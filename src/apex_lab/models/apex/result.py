@@ -30,7 +30,7 @@ class Picture(NamedTuple):
     """N rendered frames; of a whole video with dimensions (B, T) in place of N.
 
     objects (N, R, H, W): masks; foreground (N, H, W): m_fg; reconstruction (N, 3, H, W): RGB in [0, 1].
-    log_likelihood, mask_entropy (N,): nats.
+    log_likelihood, mask_entropy (N,): nats; loose_windows (N,): see `objective.loose_windows`.
     backdrop (N, 3, H, W): the background's image; means (N, R, 3, H, W): the objects' images or None.
     """
 
@@ -39,6 +39,7 @@ class Picture(NamedTuple):
     reconstruction: Tensor
     log_likelihood: Tensor
     mask_entropy: Tensor
+    loose_windows: Tensor
     backdrop: Tensor
     means: Tensor | None
 
@@ -55,6 +56,7 @@ def video_of(pictures: Sequence[Picture], batch: int) -> Picture:
         whole("reconstruction"),
         whole("log_likelihood"),
         whole("mask_entropy"),
+        whole("loose_windows"),
         whole("backdrop"),
         None if pictures[0].means is None else whole("means"),
     )
