@@ -28,14 +28,14 @@ def border_taps(kernel: int) -> Float[Tensor, "kernel kernel"]:
     """
     missing = torch.arange(kernel) - kernel // 2  # taps cut off: at the start where negative, at the end where positive
     tap = torch.arange(kernel)
-    return ((tap >= -missing[:, None]) & (tap < kernel - missing[:, None])).float()
+    return ((tap >= -missing[:, None]) & (tap < kernel - missing[:, None])).to(torch.get_default_dtype())
 
 
 def border_classes(size: int, kernel: int) -> Float[Tensor, "kernel size"]:
     """Which class (rows) each position (columns) of an axis belongs to, 1 or 0."""
     position, half = torch.arange(size), kernel // 2
     found = position.clamp_max(half) + (position - (size - 1 - half)).clamp_min(0)
-    return F.one_hot(found, kernel).T.float()
+    return F.one_hot(found, kernel).T.to(torch.get_default_dtype())
 
 
 class _Spread(torch.autograd.Function):

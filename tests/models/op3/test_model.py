@@ -68,6 +68,23 @@ def test_the_naive_twin_agrees(weighting: str, first: int, later: int, video: Te
         assert float((found[name] - gradient).abs().max()) <= 2e-3 * float(gradient.abs().max()) + 1e-6 * largest, name
 
 
+def test_in_double_precision_the_naive_twin_agrees_to_rounding(video: Tensor) -> None:
+    """Of single precision alone it would be hard to say whether 1e-4 is rounding."""
+    torch.set_default_dtype(torch.float64)
+    try:
+        torch.manual_seed(0)
+        model, frames = Op3(SIZE, 3, 8, 4, 16), video[:, :2].double()
+        scene, twin = model(frames, context()), NaiveOp3(model)(frames, VideoNoise(0, (5, 6)))
+        torch.testing.assert_close(scene.masks, twin.masks, rtol=0, atol=1e-12)
+        loss(scene).backward()
+        found = gradients(model)
+        twin.total.backward()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    for name, wanted in gradients(model).items():
+        torch.testing.assert_close(found[name], wanted, rtol=0, atol=1e-11 * float(wanted.abs().max()) + 1e-14)
+
+
 def test_without_a_number_the_loss_is_divided_by_the_batch(video: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
     """op3.md section 4: dL/dm = -p / (P + 1e-12) / B and dL/dx = m p / (P + 1e-12) (x - y) / (3 sigma^2) / B."""
     seen: list[Seen] = []

@@ -157,6 +157,14 @@ def test_pooled_elu() -> None:
     assert torch.autograd.gradcheck(_PooledElu.apply, x)
 
 
+def test_a_second_derivative_of_the_pooled_elu_is_refused() -> None:
+    x = torch.randn(2, 3, 4, 4, requires_grad=True)
+    pooled = (_PooledElu.apply(x) ** 3).sum()
+    (first,) = torch.autograd.grad(pooled, x, create_graph=True)
+    with pytest.raises(RuntimeError, match="once_differentiable"):
+        first.square().sum().backward()
+
+
 @pytest.mark.parametrize(
     ("name", "frames", "later", "weighting"),
     [

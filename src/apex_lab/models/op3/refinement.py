@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from apex_lab.models.op3.decoder import KERNEL, WIDTH, start_conv
 from apex_lab.models.op3.likelihood import ImageGradients, Mixture
@@ -66,6 +67,7 @@ class _PooledElu(torch.autograd.Function):
         return x.mean(dim=(-2, -1))
 
     @staticmethod
+    @once_differentiable  # what is kept is neither input nor output, so a second derivative would be wrong
     def backward(ctx: Any, gradient: Tensor) -> Tensor:  # type: ignore[override]
         (x,) = ctx.saved_tensors
         each = gradient[..., None, None] / (x.shape[-1] * x.shape[-2])
