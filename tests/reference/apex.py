@@ -25,6 +25,7 @@ from apex_lab.models.apex.masks import ApexNormalisation, Masks
 from apex_lab.models.apex.model import Apex
 from apex_lab.models.apex.objective import kl_terms
 from apex_lab.models.apex.objects import Objects, Proposals, context_probability, sample_presence, scope_in_windows
+from apex_lab.models.apex.parts import Part
 from apex_lab.models.apex.result import Drawn, scene_of, video_of
 from apex_lab.models.apex.rollout import Memory, Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import Carried, carry, gather_slots
@@ -105,7 +106,8 @@ class Straightforward(Apex):
         """Explains one frame and updates the memory."""
         noise = context.noise if self.training else None
         look_at, follow_in, features = self._sources(video, i, memory)
-        proposals = self.discovery(features, look_at[:, None], self.glimpses, self.appearance, noise)
+        found = self.discovery(features[:, 0], look_at, self.glimpses, self.appearance, noise)
+        proposals = found.over_time((len(video), 1), None)
         step = self._infer(look_at, follow_in, proposals, memory, context.schedule, noise)
         return self._render(video[:, i : i + 1], proposals, step, memory, context, noise)
 
@@ -153,7 +155,8 @@ class Straightforward(Apex):
         prior = schedule["discovery_presence"] * scope_in_windows(scope, *paster.inside()) * open_
         pres = sample_presence(prob, temperature, noise) * open_
         top = prob.detach().topk(self.render_top, dim=1).indices
-        candidates = Objects.join(before, self._found(cells, pres, top))
+        found = self._found(cells, pres, top)
+        candidates = Objects(*(torch.cat(pair, dim=1) for pair in zip(before, found, strict=True)))
         exists = torch.cat([memory.valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
         kept = carry(candidates.presence, exists, memory.ids, memory.next_id, self.keep_threshold)
         alive = memory.valid
@@ -177,7 +180,7 @@ class Straightforward(Apex):
     def _remember(
         self, memory: _Memory, candidates: Objects, kept: Carried, schedule: Schedule, noise: Noise | None
     ) -> None:
-        memory.objects = candidates.gather(kept.source)
+        memory.objects = Objects(*(gather_slots(field, kept.source) for field in candidates))
         memory.ids, memory.next_id = kept.ids, kept.next_id
         memory.carried_on = self._carried_on(memory.carried_on, schedule, noise)
         memory.valid = kept.valid & memory.carried_on
@@ -199,9 +202,8 @@ class Straightforward(Apex):
         paster = self._paster(place, alpha.shape[-1])
         masks = self.masks.compose(alpha, presence, valid, paster)
         backdrop, kl_background = self._backdrop(frame[:, 0], masks, memory, noise)
-        picture = self._picture(
-            frame[:, 0], Drawn(alpha, presence, valid, place, what), paster, masks, backdrop, context
-        )
+        seen = Drawn(alpha, presence, valid, place, what)
+        picture = self._picture(Part(), frame[:, 0], step.source, seen, paster, masks, backdrop, context)
         slots = self.max_objects
         terms = {
             "nll": -picture.log_likelihood,
@@ -219,7 +221,7 @@ class Straightforward(Apex):
             "kl_background": kl_background,
             "mask_entropy": picture.mask_entropy,
         }
-        return scene_of(steps, video_of([picture], len(frame)), terms, context.detail)
+        return scene_of(steps, video_of([Part()], [picture], len(frame)), terms, context.detail)
 
     def _backdrop(self, frame: Tensor, masks: Masks, memory: _Memory, noise: Noise | None) -> tuple[Tensor, Tensor]:
         """The background's picture (B, 3, H, W) and what its latent costs (B,)."""

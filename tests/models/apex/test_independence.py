@@ -71,8 +71,7 @@ def test_permuting_the_discovery_cells_changes_nothing(render_top: int | None) -
         def shuffled(*args: object) -> Proposals:
             found = discover(*args)  # type: ignore[arg-type]
             fields = [
-                Gaussian(f.mean[:, :, order], f.std[:, :, order]) if isinstance(f, Gaussian) else f[:, :, order]
-                for f in found
+                Gaussian(f.mean[:, order], f.std[:, order]) if isinstance(f, Gaussian) else f[:, order] for f in found
             ]
             return Proposals(*fields)  # type: ignore[arg-type]
 

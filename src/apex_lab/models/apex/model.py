@@ -13,6 +13,7 @@ from torch.profiler import record_function
 
 from apex_lab.models.apex.background import Background
 from apex_lab.models.apex.encoder import ApexEncoder
+from apex_lab.models.apex.foresight import NoiseOfFrames, Plan, planned
 from apex_lab.models.apex.glimpses import Glimpses
 from apex_lab.models.apex.likelihood import Likelihood, MixtureLikelihood
 from apex_lab.models.apex.masks import MaskNormalisation, Masks
@@ -25,17 +26,20 @@ from apex_lab.models.apex.objects import (
     Posterior,
     Propagation,
     Proposals,
+    at_frames,
     context_probability,
     sample_presence,
     scope_in_windows,
+    spread,
 )
+from apex_lab.models.apex.parts import Part, in_order, parts_of
 from apex_lab.models.apex.result import Drawn, Picture, scene_of, video_of
-from apex_lab.models.apex.rollout import Claims, Frame, Memory, State, Step, frames_of, stack_steps
+from apex_lab.models.apex.rollout import Claimed, Claims, Frame, Memory, State, Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import carry
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
 from apex_lab.nn.distributions import kl_gaussian
-from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.slots import NoiseOfSlots, any_of, filled, gather_slots, may_look
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import Context, Noise, Scene, SceneModel, Schedule, Statistics
@@ -167,15 +171,20 @@ class Apex(SceneModel):
         with record_function("encoder"):
             features, encoder = self.encoder(video, None if before is None else before.encoder)
         look_at, follow_in = self.glimpses.sources(video, features, None if before is None else before.frame)
-        with record_function("discovery"):
-            proposals = self.discovery(features, look_at, self.glimpses, self.appearance, noise)
         memory = (
-            Memory.empty(len(video), self.max_objects, proposals.what.shape[-1], self.hidden, proposals.what)
+            Memory.empty(len(video), self.max_objects, self.appearance.what, self.hidden, features)
             if before is None
             else before.memory
         )
+        plan = self._plan(memory, features, context.schedule, noise)
+        with record_function("discovery"):
+            found = self._proposed(features, look_at, plan)
+            alphas = self._alpha(found.what)
         with record_function("loop over time"):
-            steps, memory = self._roll_out(look_at, follow_in, proposals, memory, context.schedule, noise)
+            claims = self._claims(alphas, found.place, plan, video.shape[:2])
+            proposals = found.over_time(video.shape[:2], plan.opened)
+            frames = frames_of(look_at, follow_in, proposals, at_frames(alphas, video.shape[:2], plan.opened))
+            steps, memory = self._roll_out(frames, claims, memory, context.schedule, plan.noise)
         with record_function("rendering"):
             return self._explain(
                 video, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z)
@@ -206,14 +215,23 @@ class Apex(SceneModel):
     def _paster(self, place: Float[Tensor, "*batch 4"], glimpse: int) -> Paster:
         return Paster(window_of(place), glimpse, self.image_size)
 
+    def _plan(self, memory: Memory, features: Tensor, schedule: Schedule, noise: Noise | None) -> Plan:
+        """What the pass works on: on a CPU, in training, as little as it can."""
+        if noise is None or not may_look(features):
+            return Plan(noise)
+        sizes = (self.discovery.grid**2, self.max_objects, self.appearance.what)
+        return planned(noise, memory.carried_on, features.shape[1], sizes, schedule, features)
+
+    def _proposed(self, features: Tensor, look_at: Tensor, plan: Plan) -> Proposals:
+        """Discovery's proposals in all frames where it may find something, (F, D, ...)."""
+        maps, noise, frames = [x.flatten(0, 1) for x in (features, look_at)], plan.noise, plan.opened
+        if frames is not None:
+            assert noise is not None
+            maps, noise = [x.index_select(0, frames) for x in maps], NoiseOfFrames(noise, frames, len(maps[0]))
+        return self.discovery(*maps, self.glimpses, self.appearance, noise)
+
     def _roll_out(
-        self,
-        look_at: Tensor,
-        follow_in: Tensor,
-        proposals: Proposals,
-        memory: Memory,
-        schedule: Schedule,
-        noise: Noise | None,
+        self, frames: list[Frame], claims: list[Claims | None], memory: Memory, schedule: Schedule, noise: Noise | None
     ) -> tuple[Step, Memory]:
         """The part that depends on the frame before, frame by frame (Eq. 2, which is Eq. 13).
 
@@ -221,29 +239,31 @@ class Apex(SceneModel):
         masks of both, is left to `_explain`.
         """
         state, valid, ids, next_id, carried_on = memory
-        alphas = self._alpha(proposals.what)
-        with record_function("discovery"):
-            claims = self._claims(alphas, proposals.place).frames()
+        followed = False
         steps = []
-        for frame, claimed in zip(frames_of(look_at, follow_in, proposals, alphas), claims, strict=True):
-            with record_function("propagation"):
-                before, posterior = self.propagation(
-                    state,
-                    self.glimpses,
-                    self.appearance,
-                    frame.look_at,
-                    frame.follow_in,
-                    valid,
-                    schedule["temperature"],
-                    noise,
-                )
-            alpha = self._alpha(before.what)
-            scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
+        for t, (frame, claimed) in enumerate(zip(frames, claims, strict=True)):
+            there = any_of(valid)
+            if there or (t == len(frames) - 1 and not followed):  # once at least, so that all weights have gradients
+                followed = True
+                with record_function("propagation"):
+                    slots = filled(valid)
+                    few, posterior = self._propagated(state, valid, slots, frame, schedule, noise)
+                    few_alpha = self._alpha(few.what)
+                    before, alpha = few, few_alpha
+                    if slots is not None:
+                        before, posterior, alpha = spread(few, posterior, few_alpha, slots, valid)
+            else:
+                before, posterior = self.propagation.nothing(state, noise)
+                alpha = frame.alpha.new_zeros(*valid.shape, *frame.alpha.shape[2:])
 
-            open_ = self._may_discover(carried_on, schedule, noise).to(scope.dtype)
-            with record_function("discovery"):
-                context = context_probability(scope, claimed.masks)
-                unexplained = scope_in_windows(scope, claimed.rows, claimed.columns)
+            open_ = self._may_discover(carried_on, schedule, noise).to(frame.prob.dtype)
+            context = unexplained = torch.ones_like(frame.prob)  # where nothing is propagated, everything is open
+            if there and claimed is not None:
+                with record_function("discovery"):
+                    paster = self._paster(few.place, few_alpha.shape[-1])
+                    scope = claimed.of_videos(1 - self.masks.foreground(few_alpha, few.presence, paster))
+                    context = claimed.put(context, context_probability(scope, claimed.masks))
+                    unexplained = claimed.put(unexplained, scope_in_windows(scope, claimed.rows, claimed.columns))
             prob = frame.prob * context * open_  # Eq. 17
             # Eq. 6: the prior of a discovery's presence, given the propagated objects
             prior = schedule["discovery_presence"] * unexplained * open_
@@ -251,7 +271,8 @@ class Apex(SceneModel):
             top = prob.detach().topk(self.render_top, dim=1).indices
             found = self._found(frame, pres, top)
 
-            candidates = Objects.join(before, found)
+            both = torch.cat([before.packed(), found.packed()], dim=1)
+            candidates = before.unpacked(both)
             exists = torch.cat([valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
             kept = carry(candidates.presence, exists, ids, next_id, self.keep_threshold)
             steps.append(
@@ -271,7 +292,7 @@ class Apex(SceneModel):
                     kept.ids,
                 )
             )
-            state, ids, next_id = candidates.gather(kept.source), kept.ids, kept.next_id
+            state, ids, next_id = before.unpacked(gather_slots(both, kept.source)), kept.ids, kept.next_id
             carried_on = self._carried_on(carried_on, schedule, noise)
             valid = kept.valid & carried_on
         video = stack_steps(steps)
@@ -279,15 +300,47 @@ class Apex(SceneModel):
         beliefs = self.propagation.beliefs(video.propagated)
         return video._replace(propagated=beliefs), Memory(state, valid, ids, next_id, carried_on)
 
-    def _claims(self, alphas: Float[Tensor, "B T D g g"], place: Float[Tensor, "B T D 4"]) -> Claims:
-        """What all cells of all frames would cover on their own: no frame waits for another."""
-        b, t, d = place.shape[:3]
-        size = part_size(b * t, d * self.image_size**2, place)
+    def _propagated(
+        self,
+        state: Objects,
+        valid: Tensor,
+        slots: Tensor | None,
+        frame: Frame,
+        schedule: Schedule,
+        noise: Noise | None,
+    ) -> tuple[Objects, Posterior]:
+        """The objects in some slots (B, n), None for all, in the next frame."""
+        total = valid.shape[1]
+        if slots is not None:
+            state, valid = state.unpacked(gather_slots(state.packed(), slots)), valid.gather(1, slots)
+            noise = None if noise is None else NoiseOfSlots(noise, slots, total)
+        return self.propagation(
+            state,
+            self.glimpses,
+            self.appearance,
+            frame.look_at,
+            frame.follow_in,
+            valid,
+            schedule["temperature"],
+            noise,
+        )
+
+    def _claims(
+        self, alphas: Float[Tensor, "F D g g"], place: Float[Tensor, "F D 4"], plan: Plan, shape: tuple[int, int]
+    ) -> list[Claims | None]:
+        """What the cells of each frame would cover on their own, where that matters: no frame waits for another."""
+        which = None if plan.hidden is None else Claimed.of(plan.hidden, plan.opened)
+        if which is not None:
+            alphas, place = (x.index_select(0, which.rows) for x in (alphas, place))
+        size = part_size(max(1, len(alphas)), alphas.shape[1] * self.image_size**2, place)
         found = []
-        for alpha, where in zip(*(x.flatten(0, 1).split(size) for x in (alphas, place)), strict=True):
+        for alpha, where in zip(*(x.split(size) for x in (alphas, place)), strict=True):
             paster = self._paster(where, alpha.shape[-1])
-            found.append(Claims(self.masks.claim(alpha, paster), *paster.inside()))
-        return Claims(*(joined(parts).unflatten(0, (b, t)) for parts in zip(*found, strict=True)))
+            found.append((self.masks.claim(alpha, paster), *paster.inside()))
+        claims = [joined(parts) for parts in zip(*found, strict=True)]
+        if which is None:
+            return [Claims(*values) for values in zip(*(x.unflatten(0, shape).unbind(1) for x in claims), strict=True)]
+        return which.frames(claims)
 
     def _carried_on(self, before: Tensor, schedule: Schedule, noise: Noise | None) -> Tensor:
         """Which videos carry their objects into the next frame, (B, 1); all in evaluation.
@@ -335,17 +388,17 @@ class Apex(SceneModel):
     ) -> Scene:
         """Rendering, likelihood, KL and the result; no frame waits for another, so a GPU does all at once."""
         b, t = video.shape[:2]
-        images = video.flatten(0, 1)
-        drawn = (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)
-        size = part_size(b * t, 3 * self.image_size**2 * steps.presence.shape[-1], video)
-        parts = [Drawn(*part) for part in zip(*(x.flatten(0, 1).split(size) for x in drawn), strict=True)]
-        pasters = [self._paster(part.place, part.alpha.shape[-1]) for part in parts]
+        images, source = video.flatten(0, 1), steps.source.flatten(0, 1)
+        drawn = [x.flatten(0, 1) for x in (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)]
+        parts = parts_of(drawn[2], 3 * self.image_size**2, video)
+        seen = [Drawn(*map(part.of_components, drawn)) for part in parts]
+        pasters = [self._paster(part.place, part.alpha.shape[-1]) for part in seen]
         masks = [
             self.masks.compose(part.alpha, part.presence, part.valid, paster)
-            for part, paster in zip(parts, pasters, strict=True)
+            for part, paster in zip(seen, pasters, strict=True)
         ]
 
-        q_background = self.background.posterior(joined(m.background for m in masks), images)
+        q_background = self.background.posterior(in_order(parts, [m.background for m in masks]), images)
         z_background = q_background.sample(noise)
         backdrop = self.background.decode(z_background)
         over_time = z_background.unflatten(0, (b, t))
@@ -353,10 +406,10 @@ class Apex(SceneModel):
         kl_background = kl_gaussian(type(q_background)(*(x.unflatten(0, (b, t)) for x in q_background)), p_background)
 
         pictures = [
-            self._picture(*part, context)
-            for part in zip(images.split(size), parts, pasters, masks, backdrop.split(size), strict=True)
+            self._picture(part, images, source, *of_part, backdrop, context)
+            for part, *of_part in zip(parts, seen, pasters, masks, strict=True)
         ]
-        picture = video_of(pictures, b)
+        picture = video_of(parts, pictures, b)
         assert isinstance(steps.propagated, Beliefs)
         slots = self.max_objects
         terms = {
@@ -380,11 +433,20 @@ class Apex(SceneModel):
         return scene_of(steps, picture, terms, context.detail, state_with(over_time[:, -1]))
 
     def _picture(
-        self, image: Tensor, part: Drawn, paster: Paster, masks: Masks, backdrop: Tensor, context: Context
+        self,
+        part: Part,
+        images: Tensor,
+        source: Tensor,
+        seen: Drawn,
+        paster: Paster,
+        masks: Masks,
+        backdrops: Tensor,
+        context: Context,
     ) -> Picture:
-        """Appearance, likelihood and mask entropy of N frames whose masks are known."""
-        colours = torch.sigmoid(self.colour_decoder(part.what.flatten(0, 1))).unflatten(0, part.presence.shape)
-        means = paster.each(colours)  # (N, R, 3, H, W)
+        """Appearance, likelihood and mask entropy of a part's N frames, whose masks are known."""
+        image, backdrop = part.of_frames(images), part.of_frames(backdrops)
+        colours = torch.sigmoid(self.colour_decoder(seen.what.flatten(0, 1))).unflatten(0, seen.presence.shape)
+        means = paster.each(colours)  # (N, n, 3, H, W)
         with record_function("likelihood"):
             log_likelihood = self.likelihood(
                 image,
@@ -396,12 +458,12 @@ class Apex(SceneModel):
                 context.schedule["sigma_bg_scale"],
             )
         return Picture(
-            masks.objects,
+            part.at(masks.objects, source),
             masks.foreground,
             (masks.objects[:, :, None] * means).sum(1) + masks.background[:, None] * backdrop,
             log_likelihood,
             mask_entropy(masks),
-            loose_windows(masks.objects, part.place, part.presence * part.valid),
+            loose_windows(masks.objects, seen.place, seen.presence * seen.valid),
             backdrop,
-            means if context.detail else None,
+            part.at(means, source) if context.detail else None,
         )

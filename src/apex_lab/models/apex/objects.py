@@ -9,14 +9,14 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from apex_lab.models.apex.glimpses import Glimpses
 from apex_lab.models.apex.windows import Windows, square_of, window_of
 from apex_lab.nn.blocks import mlp
-from apex_lab.nn.distributions import Gaussian, gaussian_from, relaxed_bernoulli
-from apex_lab.nn.slots import gather_slots
+from apex_lab.nn.distributions import Gaussian, gaussian_from, relaxed_bernoulli, standard_normal
+from apex_lab.nn.slots import gather_fields, inverse_of
 from apex_lab.scene import Noise
 
 NARROW = -3.0
@@ -38,14 +38,14 @@ class Objects(NamedTuple):
     hidden_pres: Tensor
     hidden_prior: Tensor
 
-    def gather(self, source: Tensor) -> Objects:
-        """The objects at `source` (B, S)."""
-        return Objects(*(gather_slots(field, source) for field in self))
+    def packed(self) -> Float[Tensor, "B K C"]:
+        """All fields side by side, so that one operation moves all of an object."""
+        return torch.cat([x if x.dim() == 3 else x[..., None] for x in self], dim=2)
 
-    @staticmethod
-    def join(a: Objects, b: Objects) -> Objects:
-        """The objects of `a`, then those of `b`."""
-        return Objects(*(torch.cat(pair, dim=1) for pair in zip(a, b, strict=True)))
+    def unpacked(self, packed: Float[Tensor, "B S C"]) -> Objects:
+        """Objects with fields as wide as those of `self`."""
+        parts = packed.split([x.shape[2] if x.dim() == 3 else 1 for x in self], dim=2)
+        return Objects(*(part if x.dim() == 3 else part.squeeze(2) for part, x in zip(parts, self, strict=True)))
 
     @staticmethod
     def empty(batch: int, slots: int, what: int, hidden: int, like: Tensor) -> Objects:
@@ -61,6 +61,24 @@ class Posterior(NamedTuple):
     q_what: Gaussian
     q_pres: Tensor
     hidden_prior: Tensor
+
+
+def spread(
+    objects: Objects,
+    posterior: Posterior,
+    alpha: Float[Tensor, "B n g g"],
+    slots: Int[Tensor, "B n"],
+    valid: Bool[Tensor, "B P"],
+) -> tuple[Objects, Posterior, Float[Tensor, "B P g g"]]:
+    """What is known of the objects in some slots -> in all; empty ones get another object's, and no presence."""
+    where, what, pres, _ = posterior
+    fields = [*objects, *where, *what, pres, alpha.flatten(2)]
+    *moved, drawn = gather_fields(fields, inverse_of(slots, valid.shape[1]))
+    of_objects, (m_where, s_where, m_what, s_what, pres) = moved[: len(objects)], moved[len(objects) :]
+    found = Objects(*of_objects)
+    found = found._replace(presence=torch.where(valid, found.presence, torch.zeros_like(found.presence)))
+    belief = Posterior(Gaussian(m_where, s_where), Gaussian(m_what, s_what), pres, found.hidden_prior)
+    return found, belief, drawn.unflatten(2, alpha.shape[2:])
 
 
 class Beliefs(NamedTuple):
@@ -183,6 +201,17 @@ class Propagation(nn.Module):
         objects = Objects(what, place, z_pres, hidden_where, hidden_what, hidden_pres, hidden_prior)
         return objects, Posterior(q_where, q_what, q_pres, hidden_prior)
 
+    def nothing(self, before: Objects, noise: Noise | None) -> tuple[Objects, Posterior]:
+        """What `forward` gives where no slot holds an object, without the work; it draws as many numbers."""
+        if noise is not None:
+            noise.normal(torch.empty_like(before.place))
+            noise.normal(torch.empty_like(before.what))
+            noise.uniform(torch.empty_like(before.presence))
+        objects = Objects(*(torch.zeros_like(x) for x in before))
+        return objects, Posterior(
+            standard_normal(before.place), standard_normal(before.what), objects.presence, objects.hidden_prior
+        )
+
     def beliefs(self, posterior: Posterior) -> Beliefs:
         """With the prior (Eq. 5), which nothing in the loop over time waits for; any leading shape, such as (B, T)."""
         q_where, q_what, q_pres, hidden = posterior
@@ -197,7 +226,7 @@ class Propagation(nn.Module):
 
 
 class Proposals(NamedTuple):
-    """What discovery proposes in every cell of every frame, before the context is known; (B, T, D, ...).
+    """What discovery proposes in every cell, before the context is known; (F, D, ...) for F frames, or (B, T, D, ...).
 
     q_where, q_what; what, place: samples; prob: p_proposal; hidden_what: of the appearance RNN.
     """
@@ -208,6 +237,27 @@ class Proposals(NamedTuple):
     place: Tensor
     prob: Tensor
     hidden_what: Tensor
+
+    def over_time(self, shape: tuple[int, int], frames: Int[Tensor, " F"] | None) -> Proposals:
+        """Of all frames of B videos, shape (B, T): those at `frames` (None: all), nothing proposed in the others."""
+        where, what, *rest = self
+        kinds = [
+            Gaussian(at_frames(x.mean, shape, frames), at_frames(x.std, shape, frames, 1.0)) for x in (where, what)
+        ]
+        return Proposals(*kinds, *(at_frames(x, shape, frames) for x in rest))
+
+
+def at_frames(
+    values: Float[Tensor, "N ..."], shape: tuple[int, int], frames: Int[Tensor, " N"] | None, empty: float = 0.0
+) -> Float[Tensor, "B T ..."]:
+    """Values at some of B T frames (None: all) -> at all, `empty` at the others."""
+    if frames is None:
+        return values.unflatten(0, shape)
+    return (
+        values.new_full((shape[0] * shape[1], *values.shape[1:]), empty)
+        .index_copy(0, frames, values)
+        .unflatten(0, shape)
+    )
 
 
 class Discovery(nn.Module):
@@ -237,43 +287,39 @@ class Discovery(nn.Module):
 
     def forward(
         self,
-        features: Float[Tensor, "B T F h w"],
-        glimpse_source: Float[Tensor, "B T C h2 w2"],
+        features: Float[Tensor, "F C h w"],
+        glimpse_source: Float[Tensor, "F C2 h2 w2"],
         glimpses: Glimpses,
         appearance: Appearance,
         noise: Noise | None,
     ) -> Proposals:
-        """Feature maps -> proposals of all cells of all frames."""
-        b, t = features.shape[:2]
+        """Feature maps -> proposals of all cells of all frames, (F, D, ...)."""
         step = features.shape[-1] // self.grid
-        cells = features.flatten(0, 1)[..., step // 2 :: step, step // 2 :: step]  # c_d, equally spaced
+        cells = features[..., step // 2 :: step, step // 2 :: step]  # c_d, equally spaced
         d = self.grid**2
         # Eq. 16, last factor: z_where
         raw = self.head_where(cells).contiguous()  # in this layout noise is drawn, on every device
-        q_where = gaussian_from(raw.flatten(2).transpose(1, 2))  # (B T, D, 4)
+        q_where = gaussian_from(raw.flatten(2).transpose(1, 2))  # (F, D, 4)
         place = self.windows.discovered(q_where.sample(noise))
         window = window_of(place)
 
         # Eq. 16, second factor: z_what
-        code = glimpses.look(glimpse_source.flatten(0, 1), window).flatten(0, 1)
+        code = glimpses.look(glimpse_source, window).flatten(0, 1)
         nothing = code.new_zeros(code.shape[0], appearance.what)
         q_what, hidden = appearance(code, nothing, code.new_zeros(code.shape[0], appearance.rnn.hidden_size))
-        what = q_what.sample(noise).unflatten(0, (b * t, d))
+        what = q_what.sample(noise).unflatten(0, (-1, d))
 
         # p_proposal of Eq. 17, the first factor of Eq. 16 with p_context, which the loop over time adds
         evidence = torch.cat([cells.flatten(2).transpose(1, 2), what, window], dim=-1)
         prob = torch.sigmoid(self.head_pres(evidence)).squeeze(-1)
 
-        def over_time(x: Tensor) -> Tensor:
-            return x.reshape(b, t, d, *x.shape[2:])
-
         return Proposals(
-            Gaussian(over_time(q_where.mean), over_time(q_where.std)),
-            Gaussian(*(x.reshape(b, t, d, -1) for x in q_what)),
-            over_time(what),
-            over_time(place),
-            over_time(prob),
-            hidden.reshape(b, t, d, -1),
+            q_where,
+            Gaussian(*(x.unflatten(0, (-1, d)) for x in q_what)),
+            what,
+            place,
+            prob,
+            hidden.unflatten(0, (-1, d)),
         )
 
 

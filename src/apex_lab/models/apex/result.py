@@ -9,29 +9,30 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from apex_lab.models.apex.parts import Part, in_order
 from apex_lab.models.apex.rollout import State, Step
 from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.slots import gather_slots
-from apex_lab.nn.splitting import joined
 from apex_lab.scene import BACKGROUND_ID, Scene
 
 
 class Drawn(NamedTuple):
-    """Inputs of rendering N frames: fields of `Step` of R components."""
+    """Inputs of rendering N frames: fields of `Step` of n components."""
 
-    alpha: Float[Tensor, "N R g g"]
-    presence: Float[Tensor, "N R"]
-    valid: Bool[Tensor, "N R"]
-    place: Float[Tensor, "N R 4"]
-    what: Float[Tensor, "N R Z"]
+    alpha: Float[Tensor, "N n g g"]
+    presence: Float[Tensor, "N n"]
+    valid: Bool[Tensor, "N n"]
+    place: Float[Tensor, "N n 4"]
+    what: Float[Tensor, "N n Z"]
 
 
 class Picture(NamedTuple):
     """N rendered frames; of a whole video with dimensions (B, T) in place of N.
 
-    objects (N, R, H, W): masks; foreground (N, H, W): m_fg; reconstruction (N, 3, H, W): RGB in [0, 1].
+    objects (N, P, H, W): masks of what the slots hold after filtering, arbitrary where a slot holds nothing.
+    foreground (N, H, W): m_fg; reconstruction (N, 3, H, W): RGB in [0, 1].
     log_likelihood, mask_entropy (N,): nats; loose_windows (N,): see `objective.loose_windows`.
-    backdrop (N, 3, H, W): the background's image; means (N, R, 3, H, W): the objects' images or None.
+    backdrop (N, 3, H, W): the background's image; means (N, P, 3, H, W): the objects' images or None.
     """
 
     objects: Tensor
@@ -44,11 +45,11 @@ class Picture(NamedTuple):
     means: Tensor | None
 
 
-def video_of(pictures: Sequence[Picture], batch: int) -> Picture:
-    """Rendered parts of `batch` videos, all of whose frames are in order -> dimensions (B, T) in place of N."""
+def video_of(parts: Sequence[Part], pictures: Sequence[Picture], batch: int) -> Picture:
+    """Rendered parts of `batch` videos -> dimensions (B, T) in place of N."""
 
     def whole(name: str) -> Tensor:
-        return joined(getattr(picture, name) for picture in pictures).unflatten(0, (batch, -1))
+        return in_order(parts, [getattr(picture, name) for picture in pictures]).unflatten(0, (batch, -1))
 
     return Picture(
         whole("objects"),
@@ -79,13 +80,13 @@ def scene_of(
         return gather_slots(values.flatten(0, 1), flat).unflatten(0, (b, t))
 
     carried = steps.carried
-    objects = held(picture.objects) * carried[..., None, None]
+    objects = picture.objects * carried[..., None, None]
     presence = held(steps.presence) * carried
     window = window_of(held(steps.place)).masked_fill(~carried[..., None], torch.nan)
     what = held(steps.what) * carried[..., None]
     live = carried.sum(-1).clamp_min(1)
     kept = (steps.alive * steps.propagated.q_pres).sum() / steps.alive.sum().clamp_min(1)
-    means = picture.means
+    means = None if picture.means is None else picture.means * carried[..., None, None, None]
     return Scene(
         masks=torch.cat([objects, (1 - objects.sum(2, keepdim=True)).clamp_min(0)], dim=2),
         background=torch.arange(slots + 1, device=carried.device) == slots,
@@ -95,7 +96,7 @@ def scene_of(
         reconstruction=picture.reconstruction,
         terms=terms,
         windows=torch.cat([window, torch.full_like(window[..., :1, :], torch.nan)], dim=2) if detail else None,
-        means=None if means is None else torch.cat([held(means), picture.backdrop[:, :, None]], dim=2),
+        means=None if means is None else torch.cat([means, picture.backdrop[:, :, None]], dim=2),
         diagnostics={
             **{f"share_{i}": share for i, share in enumerate(_shares(objects))},
             "live_objects": carried.float().sum(-1).mean(),

@@ -39,18 +39,48 @@ def frames_of(look_at: Tensor, follow_in: Tensor, proposals: Proposals, alphas: 
 
 
 class Claims(NamedTuple):
-    """What the cells of a frame, or with dimensions (B, T) in place of B of all frames, would cover (Eq. 18).
+    """What the cells of a frame would cover, each on its own (Eq. 18), in N of its B videos.
 
-    masks (B, D, H, W): each on its own. rows (B, D, H), columns (B, D, W): as of `Paster.inside`.
+    masks (N, D, H, W). rows (N, D, H), columns (N, D, W): as of `Paster.inside`. videos (N,): which; None: all.
     """
 
     masks: Tensor
     rows: Tensor
     columns: Tensor
+    videos: Int[Tensor, " N"] | None = None
 
-    def frames(self) -> list[Claims]:
-        """Video -> frames."""
-        return [Claims(*values) for values in zip(*(x.unbind(1) for x in self), strict=True)]
+    def of_videos(self, values: Float[Tensor, "B ..."]) -> Float[Tensor, "N ..."]:
+        """Values of these videos."""
+        return values if self.videos is None else values.index_select(0, self.videos)
+
+    def put(self, others: Float[Tensor, "B ..."], values: Float[Tensor, "N ..."]) -> Float[Tensor, "B ..."]:
+        """Values of these videos among those of all."""
+        return values if self.videos is None else others.index_copy(0, self.videos, values)
+
+
+class Claimed(NamedTuple):
+    """In which frames of which videos claims matter, frame by frame.
+
+    rows (N,): where these frames' proposals lie. videos: of each of the T frames.
+    """
+
+    rows: Int[Tensor, " N"]
+    videos: list[Int[Tensor, " N_t"]]
+
+    @staticmethod
+    def of(where: Bool[Tensor, "B T"], opened: Int[Tensor, " M"] | None) -> Claimed:
+        """Claims matter at `where`, which lies within `opened`: the frames (b T + t) with proposals, None for all."""
+        b, t = where.shape
+        rows = torch.arange(b * t)
+        if opened is not None:
+            rows = rows.index_copy(0, opened, torch.arange(len(opened)))
+        return Claimed(rows.view(b, t).T[where.T], [videos.nonzero().squeeze(1) for videos in where.unbind(1)])
+
+    def frames(self, claims: list[Tensor]) -> list[Claims | None]:
+        """Masks, rows and columns (N, ...) -> those of each frame; None where there are none."""
+        counts = [len(videos) for videos in self.videos]
+        each = zip(*(values.split(counts) for values in claims), self.videos, strict=True)
+        return [Claims(*values) if len(values[0]) else None for values in each]
 
 
 FIRST_ID = 1
