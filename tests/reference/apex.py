@@ -220,6 +220,7 @@ class Straightforward(Apex):
             ),
             "kl_background": kl_background,
             "mask_entropy": picture.mask_entropy,
+            "loose_windows": picture.loose_windows,
         }
         return scene_of(steps, video_of([Part()], [picture], len(frame)), terms, context.detail)
 

@@ -181,9 +181,10 @@ class Apex(SceneModel):
             found = self._proposed(features, look_at, plan)
             alphas = self._alpha(found.what)
         with record_function("loop over time"):
-            claims = self._claims(alphas, found.place, plan, video.shape[:2])
-            proposals = found.over_time(video.shape[:2], plan.opened)
-            frames = frames_of(look_at, follow_in, proposals, at_frames(alphas, video.shape[:2], plan.opened))
+            shape = (video.shape[0], video.shape[1])
+            claims = self._claims(alphas, found.place, plan, shape)
+            proposals = found.over_time(shape, plan.opened)
+            frames = frames_of(look_at, follow_in, proposals, at_frames(alphas, shape, plan.opened))
             steps, memory = self._roll_out(frames, claims, memory, context.schedule, plan.noise)
         with record_function("rendering"):
             return self._explain(
@@ -406,8 +407,8 @@ class Apex(SceneModel):
         kl_background = kl_gaussian(type(q_background)(*(x.unflatten(0, (b, t)) for x in q_background)), p_background)
 
         pictures = [
-            self._picture(part, images, source, *of_part, backdrop, context)
-            for part, *of_part in zip(parts, seen, pasters, masks, strict=True)
+            self._picture(part, images, source, visible, paster, found, backdrop, context)
+            for part, visible, paster, found in zip(parts, seen, pasters, masks, strict=True)
         ]
         picture = video_of(parts, pictures, b)
         assert isinstance(steps.propagated, Beliefs)

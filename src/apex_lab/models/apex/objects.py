@@ -240,11 +240,12 @@ class Proposals(NamedTuple):
 
     def over_time(self, shape: tuple[int, int], frames: Int[Tensor, " F"] | None) -> Proposals:
         """Of all frames of B videos, shape (B, T): those at `frames` (None: all), nothing proposed in the others."""
-        where, what, *rest = self
-        kinds = [
-            Gaussian(at_frames(x.mean, shape, frames), at_frames(x.std, shape, frames, 1.0)) for x in (where, what)
-        ]
-        return Proposals(*kinds, *(at_frames(x, shape, frames) for x in rest))
+        q_where, q_what = (
+            Gaussian(at_frames(x.mean, shape, frames), at_frames(x.std, shape, frames, 1.0))
+            for x in (self.q_where, self.q_what)
+        )
+        rest = (self.what, self.place, self.prob, self.hidden_what)
+        return Proposals(q_where, q_what, *(at_frames(x, shape, frames) for x in rest))
 
 
 def at_frames(
