@@ -31,6 +31,7 @@ from apex_lab.config.job import check_job
 from apex_lab.training import update as updates
 from apex_lab.training.optimizers import Muon
 from tests.conftest import TINY, Ended, compose_job
+from tests.models.apex.small import everything
 from tests.training.replayed import Replayed
 
 APEX = ("model=apex", "data=p2d", "scale=smoke", "trainer=cpu")
@@ -97,7 +98,7 @@ def test_nothing_in_the_training_step_waits_for_the_device(words: tuple[str, ...
     before = [p.detach().clone() for p in work.model.parameters()]
     assert work.optimizer is not None
     # without Adam, which reads its step counts; they lie on the host, so that waits for nothing on a GPU
-    with no_synchronisation():
+    with everything(), no_synchronisation():
         work.update(work.video, work.optimizer, update=lambda: None)
     work.optimizer.step()
     assert any(not torch.equal(a, b) for a, b in zip(before, work.model.parameters(), strict=True))

@@ -174,11 +174,11 @@ def test_the_same_seed_gives_the_same_losses() -> None:
 def test_z_what_zero_gives_discovery_and_propagation_the_same_appearance() -> None:
     """Discovery infers z_what with the same networks as propagation, from z_what_0 = 0."""
     model = tiny().eval()
-    e = torch.randn(1, 1, 8, 8, 8)
+    e = torch.randn(1, 8, 8, 8)
     proposals = model.discovery(e, e, model.glimpses, model.appearance, None)
-    code = model.glimpses.look(e[:, 0], window_of(proposals.place[:, 0])).flatten(0, 1)
+    code = model.glimpses.look(e, window_of(proposals.place)).flatten(0, 1)
     q, _ = model.appearance(code, torch.zeros(16, 6), torch.zeros(16, 12))
-    torch.testing.assert_close(proposals.q_what.mean[0, 0], q.mean)
+    torch.testing.assert_close(proposals.q_what.mean[0], q.mean)
     assert isinstance(q, Gaussian)
 
 
