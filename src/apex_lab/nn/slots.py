@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import torch
@@ -87,8 +88,28 @@ def gather_fields(fields: Sequence[Float[Tensor, "B K ..."]], source: Int[Tensor
     return [x if field.dim() == 3 else x.squeeze(2) for x, field in zip(values, fields, strict=True)]
 
 
-class NoiseOfSlots(Noise):
-    """Noise that is drawn for all slots, of which some are worked on: a slot's numbers are those it would get anyway.
+class NoiseOfSome(Noise, ABC):
+    """Noise that is drawn for all, of whom some are worked on: each gets the numbers that it would get anyway."""
+
+    _noise: Noise
+
+    def normal(self, like: Tensor) -> Tensor:
+        return self._some(self._noise.normal(self._whole(like)))
+
+    def uniform(self, like: Tensor) -> Tensor:
+        return self._some(self._noise.uniform(self._whole(like)))
+
+    @abstractmethod
+    def _whole(self, like: Tensor) -> Tensor:
+        """An empty tensor for all, where `like` is for some."""
+
+    @abstractmethod
+    def _some(self, drawn: Tensor) -> Tensor:
+        """The numbers of those that are worked on."""
+
+
+class NoiseOfSlots(NoiseOfSome):
+    """Noise of some slots.
 
     Args:
         noise: for all slots.
@@ -99,11 +120,8 @@ class NoiseOfSlots(Noise):
     def __init__(self, noise: Noise, slots: Int[Tensor, "B n"], total: int) -> None:
         self._noise, self._slots, self._total = noise, slots, total
 
-    def normal(self, like: Tensor) -> Tensor:
-        return gather_slots(self._noise.normal(self._whole(like)), self._slots)
-
-    def uniform(self, like: Tensor) -> Tensor:
-        return gather_slots(self._noise.uniform(self._whole(like)), self._slots)
-
     def _whole(self, like: Tensor) -> Tensor:
         return like.new_empty(len(like), self._total, *like.shape[2:])
+
+    def _some(self, drawn: Tensor) -> Tensor:
+        return gather_slots(drawn, self._slots)

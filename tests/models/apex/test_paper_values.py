@@ -39,3 +39,12 @@ def test_sigma_fg_at_the_ends_of_a_training(scale: str, first: float, last: floa
     config = resolved("model=apex", "data=p2d", f"scale={scale}")
     sigma_fg = components.build(config["schedule"]["sigma_fg_scale"], "schedule.sigma_fg_scale")
     assert (sigma_fg(0), sigma_fg(config["trainer"]["max_steps"])) == (first, last)
+
+
+def test_fitted_windows_shrink_once_objects_are_there_and_cost_no_more_later() -> None:
+    config = resolved("model=apex", "data=p2d", "scale=cpu", "+experiment=fitted_windows")
+    weights = {name: components.build(config["loss"][name], f"loss.{name}") for name in ("loose_windows", "kl_pres")}
+    assert [weights["loose_windows"](step) for step in (0, 500, 1_000, 1_500, 8_000)] == [0.0, 0.0, 100.0, 200.0, 200.0]
+    assert [weights["kl_pres"](step) for step in (0, 8_000)] == [8.0, 8.0]
+    rate = components.build(config["lr_scale"], "lr_scale")
+    assert (rate(3_000), rate(config["trainer"]["max_steps"])) == (1.0, pytest.approx(0.05))

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from apex_lab.nn.slots import NoiseOfSome
 from apex_lab.scene import Noise, Schedule
 
 Kind = Literal["normal", "uniform"]
@@ -43,8 +44,8 @@ class Foreseen(Noise):
         return drawn
 
 
-class NoiseOfFrames(Noise):
-    """Noise that is drawn for all F frames, of which some are worked on; first dimension F, or F and what follows.
+class NoiseOfFrames(NoiseOfSome):
+    """Noise of some of F frames; first dimension F, or F and what follows.
 
     Args:
         noise: for all frames.
@@ -54,12 +55,6 @@ class NoiseOfFrames(Noise):
 
     def __init__(self, noise: Noise, frames: Int[Tensor, " N"], total: int) -> None:
         self._noise, self._frames, self._total = noise, frames, total
-
-    def normal(self, like: Tensor) -> Tensor:
-        return self._some(self._noise.normal(self._whole(like)))
-
-    def uniform(self, like: Tensor) -> Tensor:
-        return self._some(self._noise.uniform(self._whole(like)))
 
     def _whole(self, like: Tensor) -> Tensor:
         return like.new_empty(len(like) // len(self._frames) * self._total, *like.shape[1:])
