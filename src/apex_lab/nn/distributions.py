@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
+from apex_lab.nn.precision import full
 from apex_lab.scene import Noise
 
 
@@ -73,8 +74,7 @@ def relaxed_logit(
 
     Probabilities and uniform numbers are kept `tiny` from 0 and 1. P(sample > 0) = prob.
     """
-    prob, u = prob.clamp(tiny, 1 - tiny), uniform.clamp(tiny, 1 - tiny)
-    return (prob.log() - (-prob).log1p() + u.log() - (-u).log1p()) / temperature
+    return (torch.logit(full(prob), tiny) + torch.logit(full(uniform), tiny)) / temperature
 
 
 def relaxed_bernoulli(

@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
+from apex_lab.nn.slots import may_look
+
 Sigma = Annotated[float, Field(gt=0, le=10)]
 
 
@@ -48,8 +50,14 @@ class _LogMixture(torch.autograd.Function):
         sigma_bg: Tensor,
     ) -> Tensor:
         """Shapes as in `Likelihood.__call__`, sigmas 0-dim -> log density (N, 3, H, W) in nats."""
-        by_object = (image[:, None] - objects).square_().mul_(-0.5 / sigma_fg**2)
-        by_object += (log_objects - sigma_fg.log())[:, :, None]
+        precision_fg: float | Tensor = 1 / sigma_fg**2
+        by_object = image[:, None] - objects
+        prior = (log_objects - sigma_fg.log())[:, :, None]
+        if may_look(image):  # with a number in place of a tensor, one pass in place of three
+            precision_fg = float(precision_fg)
+            torch.addcmul(prior, by_object, by_object, value=-0.5 * precision_fg, out=by_object)
+        else:
+            by_object = by_object.square_().mul_(-0.5 * precision_fg).add_(prior)
         by_background = (image - background).square_().mul_(-0.5 / sigma_bg**2)
         by_background += (log_background - sigma_bg.log())[:, None]
         highest = torch.maximum(by_object.amax(1), by_background)
@@ -59,7 +67,7 @@ class _LogMixture(torch.autograd.Function):
         shares /= total[:, None]
         share_background /= total
         ctx.save_for_backward(shares, share_background, image, objects, background)
-        ctx.precision = (1 / sigma_fg**2, 1 / sigma_bg**2)
+        ctx.precision = (precision_fg, 1 / sigma_bg**2)
         return total.log_().add_(highest).sub_(0.5 * math.log(2 * math.pi))
 
     @staticmethod
@@ -68,7 +76,10 @@ class _LogMixture(torch.autograd.Function):
         precision_fg, precision_bg = ctx.precision
         by_object, by_background = shares * grad[:, None], share_background * grad
         to_log_objects, to_log_background = by_object.sum(2), by_background.sum(1)
-        to_objects = by_object.mul_(image[:, None] - objects).mul_(precision_fg)
+        if isinstance(precision_fg, float):
+            to_objects = by_object.mul_(torch.sub(precision_fg * image[:, None], objects, alpha=precision_fg))
+        else:
+            to_objects = by_object.mul_(image[:, None] - objects).mul_(precision_fg)
         to_background = by_background.mul_(image - background).mul_(precision_bg)
         to_image = -(to_objects.sum(1) + to_background) if ctx.needs_input_grad[0] else None
         return to_image, to_log_objects, to_objects, to_log_background, to_background, None, None
