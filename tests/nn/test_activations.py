@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from apex_lab.nn.activations import MANY, Celu, exp, tanh
+from apex_lab.nn.activations import MANY, Celu, exp, exp_, tanh
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-14), (torch.float32, 3e-7)])
@@ -36,4 +36,5 @@ def test_exp() -> None:
     x = torch.linspace(-20, 10, 999)
     torch.testing.assert_close(exp(x), x.exp(), rtol=3e-6, atol=0)
     torch.testing.assert_close(exp(x.double()), x.double().exp(), rtol=1e-14, atol=0)
+    assert torch.equal(exp_(x.clone()), exp(x))
     assert exp(torch.tensor([-torch.inf])) == 0

@@ -23,6 +23,11 @@ def exp(x: Tensor) -> Tensor:
     return (x * math.log2(math.e)).exp2_() if may_look(x) else x.exp()
 
 
+def exp_(x: Tensor) -> Tensor:
+    """The same in place."""
+    return x.mul_(math.log2(math.e)).exp2_() if may_look(x) else x.exp_()
+
+
 def tanh(x: Tensor) -> Tensor:
     """In float32 exact to 1e-7, not to the last digit near zero."""
     return _Tanh.apply(x) if may_look(x) and x.numel() >= MANY else torch.tanh(x)

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
+from apex_lab.nn.activations import exp_
 from apex_lab.nn.slots import may_look
 
 Sigma = Annotated[float, Field(gt=0, le=10)]
@@ -28,7 +29,7 @@ NEGLIGIBLE = -80.0
 
 def _exp_(x: Tensor) -> Tensor:
     """exp in place; below `NEGLIGIBLE` exactly zero, where CPUs take ten times as long for numbers that underflow."""
-    return torch.threshold_(x.clamp_min_(NEGLIGIBLE).exp_(), 1.001 * math.exp(NEGLIGIBLE), 0.0)
+    return torch.threshold_(exp_(x.clamp_min_(NEGLIGIBLE)), 1.001 * math.exp(NEGLIGIBLE), 0.0)
 
 
 class _LogMixture(torch.autograd.Function):

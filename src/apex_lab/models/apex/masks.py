@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor
 
+from apex_lab.nn.activations import exp, tanh
 from apex_lab.nn.precision import full
 from apex_lab.nn.spatial_transformer import Paster
 
@@ -75,7 +76,7 @@ class _Claim(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, warped: Tensor, rows: Tensor, columns: Tensor) -> Tensor:  # type: ignore[override]
         # tanh(softplus(x)) = n / (n + 2) with n = e^x (e^x + 2): one exponential, no logarithm
-        power = warped.exp()
+        power = exp(warped)
         cover = power.add(2).mul_(power)
         cover.div_(torch.add(cover, 2, out=power))
         claims = (cover * rows[..., :, None]).mul_(columns[..., None, :])
@@ -113,7 +114,7 @@ class _Compete(torch.autograd.Function):
         logit = full(warped) + shift[..., None, None]
         # A common shift changes no share, but logits of 3 c would cost the float32 sum of the masks its sixth decimal.
         logit -= logit.amax(-3).masked_fill_(nothing, 0.0)[..., None, :, :]
-        share = logit.exp()
+        share = exp(logit)
         total = share.sum(-3).masked_fill_(nothing, 1.0)
         share /= total[..., None, :, :]  # Eq. 10
         logit += (log_foreground - total.log_())[..., None, :, :]
@@ -147,7 +148,7 @@ class ApexNormalisation(MaskNormalisation):
 
     def logits(self, raw: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """alpha = c tanh(CNN(z_what)) (Eq. 7)."""
-        return self.c * torch.tanh(raw)
+        return self.c * tanh(raw)
 
     def _occupancy(
         self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster
@@ -159,7 +160,7 @@ class ApexNormalisation(MaskNormalisation):
         self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster
     ) -> Float[Tensor, "... H W"]:
         """m_fg = tanh(s) (Eq. 8)."""
-        return torch.tanh(self._occupancy(alpha, presence, paster))
+        return tanh(self._occupancy(alpha, presence, paster))
 
     def claim(self, alpha: Float[Tensor, "... K g g"], paster: Paster) -> Float[Tensor, "... K H W"]:
         """tanh(softplus(alpha)) of the warped logits, inside the window only (the weights of p_context, Eq. 18)."""
@@ -191,7 +192,7 @@ class ApexNormalisation(MaskNormalisation):
         foreground = torch.tanh(s)  # Eq. 8
         # Exactly nothing where no window reaches: a floor there would let a component's empty surroundings, which are
         # black, explain dark pixels that the background misses.
-        log_foreground = torch.log(torch.tanh(s.clamp_min(TINY))).masked_fill(s < TINY, -torch.inf)
+        log_foreground = foreground.clamp_min(TINY).log().masked_fill(s < TINY, -torch.inf)
         objects, log_objects = _Compete.apply(
             *self._competition(alpha, presence, valid, paster), foreground, log_foreground
         )
