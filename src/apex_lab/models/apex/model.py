@@ -34,12 +34,12 @@ from apex_lab.models.apex.objects import (
 )
 from apex_lab.models.apex.parts import Part, in_order, parts_of
 from apex_lab.models.apex.result import Drawn, Picture, scene_of, video_of
-from apex_lab.models.apex.rollout import Claimed, Claims, Frame, Memory, State, Step, frames_of, stack_steps
+from apex_lab.models.apex.rollout import Claimed, Claims, FollowedMasks, Frame, Memory, State, Step, frames_of, stack_steps
 from apex_lab.models.apex.slots import carry
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
 from apex_lab.nn.distributions import kl_gaussian
-from apex_lab.nn.slots import NoiseOfSlots, any_of, filled, gather_slots, may_look
+from apex_lab.nn.slots import NoiseOfSlots, any_of, filled, gather_slots, inverse_of, may_look
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import Context, Noise, Scene, SceneModel, Schedule, Statistics
@@ -241,7 +241,8 @@ class Apex(SceneModel):
         """
         state, valid, ids, next_id, carried_on = memory
         followed = False
-        steps = []
+        steps: list[Step] = []
+        followed_masks: list[FollowedMasks | None] = []
         for t, (frame, claimed) in enumerate(zip(frames, claims, strict=True)):
             there = any_of(valid)
             if there or (t == len(frames) - 1 and not followed):  # once at least, so that all weights have gradients
@@ -249,17 +250,19 @@ class Apex(SceneModel):
                 with record_function("propagation"):
                     slots = filled(valid)
                     few, posterior = self._propagated(state, valid, slots, frame, schedule, noise)
-                    few_alpha = self._alpha(few.what)
-                    before, alpha = few, few_alpha
+                    before = few
                     if slots is not None:
-                        before, posterior, alpha = spread(few, posterior, few_alpha, slots, valid)
+                        before, posterior = spread(few, posterior, slots, valid)
+                    few_alpha = None if claimed is None else self._alpha(few.what)
+                    followed_masks.append(FollowedMasks(few.what, few_alpha, slots))
             else:
                 before, posterior = self.propagation.nothing(state, noise)
-                alpha = frame.alpha.new_zeros(*valid.shape, *frame.alpha.shape[2:])
+                followed_masks.append(None)
 
             open_ = self._may_discover(carried_on, schedule, noise).to(frame.prob.dtype)
             context = unexplained = torch.ones_like(frame.prob)  # where nothing is propagated, everything is open
             if there and claimed is not None:
+                assert few_alpha is not None
                 with record_function("discovery"):
                     paster = self._paster(few.place, few_alpha.shape[-1])
                     scope = claimed.of_videos(1 - self.masks.foreground(few_alpha, few.presence, paster))
@@ -280,7 +283,7 @@ class Apex(SceneModel):
                 Step(
                     candidates.what,
                     candidates.place,
-                    torch.cat([alpha, gather_slots(frame.alpha, top)], dim=1),
+                    gather_slots(frame.alpha, top),
                     candidates.presence,
                     exists & (candidates.presence > 0),
                     valid,
@@ -299,7 +302,8 @@ class Apex(SceneModel):
         video = stack_steps(steps)
         assert isinstance(video.propagated, Posterior)
         beliefs = self.propagation.beliefs(video.propagated)
-        return video._replace(propagated=beliefs), Memory(state, valid, ids, next_id, carried_on)
+        alpha = torch.cat([self._followed(followed_masks, video.alpha, valid.shape[1]), video.alpha], dim=2)
+        return video._replace(propagated=beliefs, alpha=alpha), Memory(state, valid, ids, next_id, carried_on)
 
     def _propagated(
         self,
@@ -325,6 +329,21 @@ class Apex(SceneModel):
             schedule["temperature"],
             noise,
         )
+
+    def _followed(
+        self, frames: list[FollowedMasks | None], like: Float[Tensor, "B T N g g"], total: int
+    ) -> Float[Tensor, "B T P g g"]:
+        """Mask logits of all slots in all frames; those that the loop could do without are made here, at once."""
+        waiting = [frame.what for frame in frames if frame is not None and frame.alpha is None]
+        made = iter(self._alpha(torch.cat(waiting, dim=1)).split([x.shape[1] for x in waiting], dim=1) if waiting else ())
+        found = []
+        for frame in frames:
+            if frame is None:
+                found.append(like.new_zeros(len(like), total, *like.shape[3:]))
+                continue
+            alpha = next(made) if frame.alpha is None else frame.alpha
+            found.append(alpha if frame.slots is None else gather_slots(alpha, inverse_of(frame.slots, total)))
+        return torch.stack(found, dim=1)
 
     def _claims(
         self, alphas: Float[Tensor, "F D g g"], place: Float[Tensor, "F D 4"], plan: Plan, shape: tuple[int, int]

@@ -66,19 +66,16 @@ class Posterior(NamedTuple):
 def spread(
     objects: Objects,
     posterior: Posterior,
-    alpha: Float[Tensor, "B n g g"],
     slots: Int[Tensor, "B n"],
     valid: Bool[Tensor, "B P"],
-) -> tuple[Objects, Posterior, Float[Tensor, "B P g g"]]:
+) -> tuple[Objects, Posterior]:
     """What is known of the objects in some slots -> in all; empty ones get another object's, and no presence."""
     where, what, pres, _ = posterior
-    fields = [*objects, *where, *what, pres, alpha.flatten(2)]
-    *moved, drawn = gather_fields(fields, inverse_of(slots, valid.shape[1]))
+    moved = gather_fields([*objects, *where, *what, pres], inverse_of(slots, valid.shape[1]))
     of_objects, (m_where, s_where, m_what, s_what, pres) = moved[: len(objects)], moved[len(objects) :]
     found = Objects(*of_objects)
     found = found._replace(presence=torch.where(valid, found.presence, torch.zeros_like(found.presence)))
-    belief = Posterior(Gaussian(m_where, s_where), Gaussian(m_what, s_what), pres, found.hidden_prior)
-    return found, belief, drawn.unflatten(2, alpha.shape[2:])
+    return found, Posterior(Gaussian(m_where, s_where), Gaussian(m_what, s_what), pres, found.hidden_prior)
 
 
 class Beliefs(NamedTuple):

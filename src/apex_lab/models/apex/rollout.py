@@ -83,6 +83,18 @@ class Claimed(NamedTuple):
         return [Claims(*values) if len(values[0]) else None for values in each]
 
 
+class FollowedMasks(NamedTuple):
+    """Masks of the objects that were propagated into a frame.
+
+    what (B, n, Z). alpha (B, n, g, g): mask logits; None: not made yet. slots (B, n): where they are; None: all, in
+    order.
+    """
+
+    what: Tensor
+    alpha: Tensor | None
+    slots: Int[Tensor, "B n"] | None
+
+
 FIRST_ID = 1
 
 
