@@ -45,8 +45,10 @@ class ConvLSTM(nn.Module):
         driven = self.from_input(features.flatten(0, 1)).unflatten(0, (b, t))
         hidden, cell = (torch.zeros_like(features[:, 0]) for _ in range(2)) if state is None else state
         states = []
-        for frame in driven.unbind(1):
-            hidden, cell = self.step(frame, hidden, cell)
+        # of a hidden state of zeros the convolution is zero; a clip of one frame makes it, for its weights' gradient
+        known = state is None and t > 1 and may_look(features)
+        for i, frame in enumerate(driven.unbind(1)):
+            hidden, cell = gated(frame, cell) if known and i == 0 else self.step(frame, hidden, cell)
             states.append(hidden)
         return torch.stack(states, dim=1), (hidden, cell)
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from apex_lab.nn.activations import exp, tanh
 from apex_lab.nn.precision import full
+from apex_lab.nn.slots import may_look
 from apex_lab.nn.spatial_transformer import Paster
 
 TINY = 1e-30
@@ -36,6 +37,22 @@ class Masks(NamedTuple):
     foreground: Tensor
     background: Tensor
     log_background: Tensor
+
+
+@torch.no_grad()
+def blended(
+    objects: Float[Tensor, "N K H W"],
+    means: Float[Tensor, "N K C H W"],
+    background: Float[Tensor, "N H W"],
+    backdrop: Float[Tensor, "N C H W"],
+) -> Float[Tensor, "N C H W"]:
+    """The reconstruction, sum_k m_k mu_k, for the eye: without gradient."""
+    image = background[:, None] * backdrop
+    if not may_look(image):
+        return (objects[:, :, None] * means).sum(1) + image
+    for k in range(objects.shape[1]):  # without a tensor of all components' shares
+        image.addcmul_(objects[:, k, None], means[:, k])
+    return image
 
 
 class MaskNormalisation(ABC):

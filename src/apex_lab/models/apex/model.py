@@ -16,7 +16,7 @@ from apex_lab.models.apex.encoder import ApexEncoder
 from apex_lab.models.apex.foresight import NoiseOfFrames, Plan, planned
 from apex_lab.models.apex.glimpses import Glimpses
 from apex_lab.models.apex.likelihood import Likelihood, MixtureLikelihood
-from apex_lab.models.apex.masks import MaskNormalisation, Masks
+from apex_lab.models.apex.masks import MaskNormalisation, Masks, blended
 from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, loose_windows, mask_entropy
 from apex_lab.models.apex.objects import (
     Appearance,
@@ -480,7 +480,7 @@ class Apex(SceneModel):
         return Picture(
             part.at(masks.objects, source),
             masks.foreground,
-            (masks.objects[:, :, None] * means).sum(1) + masks.background[:, None] * backdrop,
+            blended(masks.objects, means, masks.background, backdrop),
             log_likelihood,
             mask_entropy(masks),
             loose_windows(masks.objects, seen.place, seen.presence * seen.valid),
