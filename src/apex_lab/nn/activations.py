@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from apex_lab.nn.rows import elu
 from apex_lab.nn.slots import may_look
 
-MANY = 4096
+MANY = 2**16
 """Numbers from which on it pays."""
 
 

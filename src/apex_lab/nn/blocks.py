@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from apex_lab.nn.activations import Celu
+from apex_lab.nn.activations import MANY, Celu
 from apex_lab.nn.layout import for_convolutions
 from apex_lab.nn.slots import may_look
 from apex_lab.nn.spatial_transformer import pixel_centres
@@ -43,7 +43,7 @@ class DoubledMaps(nn.PixelShuffle):
         super().__init__(2)
 
     def forward(self, x: Float[Tensor, "N C4 h w"]) -> Float[Tensor, "N C 2*h 2*w"]:
-        if x.shape[1] != 4 or not may_look(x):
+        if x.shape[1] != 4 or x.numel() < MANY or not may_look(x):
             return super().forward(x)
         # neighbours in a row, which stay so, move as one complex number
         pairs = torch.view_as_complex(x.permute(0, 2, 3, 1).contiguous().unflatten(3, (2, 2)))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -63,32 +61,6 @@ def gated(
     gates: Float[Tensor, "B C4 h w"], cell: Float[Tensor, "B C h w"]
 ) -> tuple[Float[Tensor, "B C h w"], Float[Tensor, "B C h w"]]:
     """Input, forget and output gate and candidate, before their squashing, and the cell -> hidden state and cell."""
-    if may_look(gates):
-        return _Gated.apply(gates, cell)
     gates_in, forget, out, candidate = gates.chunk(4, dim=1)
     cell = torch.sigmoid(forget) * cell + torch.sigmoid(gates_in) * torch.tanh(candidate)
     return torch.sigmoid(out) * torch.tanh(cell), cell
-
-
-class _Gated(torch.autograd.Function):
-    """`gated` in few passes, without tanh, which is slow on a CPU: tanh(x) = 2 sigmoid(2 x) - 1."""
-
-    @staticmethod
-    def forward(ctx: Any, gates: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
-        c = cell.shape[1]
-        squashed = torch.cat([gates[:, : 3 * c], 2 * gates[:, 3 * c :]], dim=1).sigmoid_()
-        gates_in, forget, out, candidate = squashed.chunk(4, dim=1)
-        candidate = (2 * candidate).sub_(1)
-        after = (forget * cell).addcmul_(gates_in, candidate)
-        shown = (2 * after).sigmoid_().mul_(2).sub_(1)
-        ctx.save_for_backward(squashed, candidate, cell, shown)
-        return out * shown, after
-
-    @staticmethod
-    def backward(ctx: Any, to_hidden: Tensor, to_after: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
-        squashed, candidate, cell, shown = ctx.saved_tensors
-        gates_in, forget, out, _ = squashed.chunk(4, dim=1)
-        to_after = to_after + torch.ops.aten.tanh_backward(to_hidden * out, shown)
-        # the derivative of tanh(x) is 4 s (1 - s) with s = sigmoid(2 x)
-        each = [to_after * candidate, to_after * cell, to_hidden * shown, (4 * to_after).mul_(gates_in)]
-        return torch.ops.aten.sigmoid_backward(torch.cat(each, dim=1), squashed), to_after * forget

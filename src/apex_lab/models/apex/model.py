@@ -39,6 +39,7 @@ from apex_lab.models.apex.slots import carry
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
 from apex_lab.nn.distributions import kl_gaussian
+from apex_lab.nn.shared import gathered_gradients
 from apex_lab.nn.slots import NoiseOfSlots, any_of, filled, gather_slots, inverse_of, may_look
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.nn.splitting import joined, part_size
@@ -185,7 +186,9 @@ class Apex(SceneModel):
             claims = self._claims(alphas, found.place, plan, shape)
             proposals = found.over_time(shape, plan.opened)
             frames = frames_of(look_at, follow_in, proposals, at_frames(alphas, shape, plan.opened))
-            steps, memory = self._roll_out(frames, claims, memory, context.schedule, plan.noise)
+            shared = (self.propagation, self.appearance, self.glimpses, self.mask_decoder)
+            with gathered_gradients(*shared, like=features):
+                steps, memory = self._roll_out(frames, claims, memory, context.schedule, plan.noise)
         with record_function("rendering"):
             return self._explain(
                 video, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z)
