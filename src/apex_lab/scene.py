@@ -61,12 +61,14 @@ class Context:
         noise: random numbers.
         state: `Scene.state` of the frames before; None at the start of a video.
         detail: fill `Scene.windows`, `Scene.means` and other costly fields.
+        unused: those of the model's `optional_terms` that nobody reads, which need not be in `Scene.terms`.
     """
 
     schedule: Schedule = field(default_factory=dict)
     noise: Noise = field(default_factory=Noise)
     state: Any = None
     detail: bool = False
+    unused: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)

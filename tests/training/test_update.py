@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
+from apex_lab.scene import Context, Scene
 from apex_lab.training.schedules import Constant, Linear
 from apex_lab.training.update import Mode, Scheduled, WeightUpdate, named_parameters, remember_rates
 from tests.tiny import Layers
@@ -42,6 +45,27 @@ def test_values_are_written_into_the_same_tensors() -> None:
     assert [float(after[name]) for name in ("a", "b")] == [0.5, 3.0]
     assert all(before[name].data_ptr() == after[name].data_ptr() for name in before)
     assert not values.state_dict()  # they follow from the step, so no checkpoint holds them
+
+
+@pytest.mark.parametrize(
+    ("weights", "unused"),
+    [({}, {"windows"}), ({"windows": Constant(0.0)}, {"windows"}), ({"windows": Linear(0.0, 1.0, 10)}, set())],
+    ids=["not named", "zero", "zero at first"],
+)
+def test_the_model_is_told_which_terms_nobody_reads(weights: dict[str, Constant | Linear], unused: set[str]) -> None:
+    found = []
+
+    class Model(Layers):
+        optional_terms = ("windows",)
+
+        def forward(self, video: torch.Tensor, context: Context) -> Scene:
+            found.append(context.unused)
+            scene = super().forward(video, context)
+            return replace(scene, terms=scene.terms | {"windows": torch.zeros(len(video))})
+
+    made = WeightUpdate(Model(), {"noise": Constant(1.0)}, WEIGHTS | weights)
+    losses(made, 1)
+    assert found == [unused]
 
 
 def test_learning_rates_are_set_before_each_update() -> None:

@@ -184,7 +184,8 @@ class WeightUpdate(nn.Module):
         with self.autocast():
             with torch.profiler.record_function("forward"):
                 frames = fitted(as_float(video), self.model.input_size)
-                scene: Scene = self.model(frames, Context(self.schedules.tensors(), noise))
+                unused = frozenset(self.model.optional_terms).difference(self.weights.schedules)
+                scene: Scene = self.model(frames, Context(self.schedules.tensors(), noise, unused=unused))
             loss = self.objective(scene.terms)
         # Lightning makes the step inside autocast too, which is meant for the forward pass alone
         with torch.autocast(video.device.type, enabled=False):

@@ -50,3 +50,13 @@ def test_what_holds_nothing_changes_no_number_and_no_gradient(changed: dict[str,
     for name, gradient in wanted.items():
         assert gradient is not None, name
         torch.testing.assert_close(gradients[name], gradient, rtol=1e-8, atol=1e-9, msg=name)
+
+
+def test_a_term_that_nobody_reads_is_left_out() -> None:
+    def terms(unused: frozenset[str]) -> dict[str, Tensor]:
+        torch.manual_seed(3)
+        return lively().double().train()(video(2, 3).double(), Context(SCHEDULE, unused=unused)).terms
+
+    wanted = terms(frozenset())
+    assert wanted.pop("loose_windows").sum() > 0
+    torch.testing.assert_close(terms(frozenset({"loose_windows"})), wanted, rtol=0, atol=0)

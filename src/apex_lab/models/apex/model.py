@@ -34,7 +34,17 @@ from apex_lab.models.apex.objects import (
 )
 from apex_lab.models.apex.parts import Part, in_order, parts_of
 from apex_lab.models.apex.result import Drawn, Picture, scene_of, video_of
-from apex_lab.models.apex.rollout import Claimed, Claims, FollowedMasks, Frame, Memory, State, Step, frames_of, stack_steps
+from apex_lab.models.apex.rollout import (
+    Claimed,
+    Claims,
+    FollowedMasks,
+    Frame,
+    Memory,
+    State,
+    Step,
+    frames_of,
+    stack_steps,
+)
 from apex_lab.models.apex.slots import carry
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
@@ -338,7 +348,8 @@ class Apex(SceneModel):
     ) -> Float[Tensor, "B T P g g"]:
         """Mask logits of all slots in all frames; those that the loop could do without are made here, at once."""
         waiting = [frame.what for frame in frames if frame is not None and frame.alpha is None]
-        made = iter(self._alpha(torch.cat(waiting, dim=1)).split([x.shape[1] for x in waiting], dim=1) if waiting else ())
+        counts = [what.shape[1] for what in waiting]
+        made = iter(self._alpha(torch.cat(waiting, dim=1)).split(counts, dim=1) if waiting else ())
         found = []
         for frame in frames:
             if frame is None:
@@ -453,6 +464,7 @@ class Apex(SceneModel):
             "mask_entropy": picture.mask_entropy.sum(1),
             "loose_windows": picture.loose_windows.sum(1),
         }
+        terms = {name: term for name, term in terms.items() if name not in context.unused}
         return scene_of(steps, picture, terms, context.detail, state_with(over_time[:, -1]))
 
     def _picture(
@@ -486,7 +498,9 @@ class Apex(SceneModel):
             blended(masks.objects, means, masks.background, backdrop),
             log_likelihood,
             mask_entropy(masks),
-            loose_windows(masks.objects, seen.place, seen.presence * seen.valid),
+            torch.zeros_like(log_likelihood)
+            if "loose_windows" in context.unused
+            else loose_windows(masks.objects, seen.place, seen.presence * seen.valid),
             backdrop,
             part.at(means, source) if context.detail else None,
         )
