@@ -56,7 +56,7 @@ def test_masks_start_at_start_mask_with_a_small_spread(start: float) -> None:
         plain = tiny()
         torch.testing.assert_close(raw, plain.mask_decoder(what) + start, rtol=0, atol=1e-5)
         assert torch.equal(model.colour_decoder(what), plain.colour_decoder(what))
-        logits = model._alpha(propose(model).what)
+        logits = model.alpha(propose(model).what)
         assert abs(float(logits.mean()) - 5 * math.tanh(start)) < 0.5  # c = 5, Eq. 7
 
 

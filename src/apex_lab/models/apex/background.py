@@ -21,6 +21,20 @@ BRIGHTEST = math.log(2)
 """Largest shade, in logits: a grey of 0.5 becomes 0.67 at most."""
 
 
+def shadowed(
+    backdrop: Float[Tensor, "*batch 3 H W"], image: Float[Tensor, "*batch 3 H W"], darkest: float
+) -> Float[Tensor, "*batch 3 H W"]:
+    """The background with every pixel as dark as the image has it, down to `darkest` times its colour. Not in the paper.
+
+    A cast shadow is the same colour, darker. Of all u b with u in [darkest, 1], the one nearest to x has
+    u = <x, b> / <b, b>, clamped. There the likelihood is largest, so u passes no gradient on.
+    """
+    with torch.no_grad():
+        u = (image * backdrop).sum(-3, keepdim=True) / backdrop.square().sum(-3, keepdim=True).clamp_min(1e-6)
+        u.clamp_(darkest, 1.0)
+    return backdrop * u
+
+
 class Background(nn.Module):
     """z_bg and its image.
 
@@ -36,6 +50,8 @@ class Background(nn.Module):
             brighten the bias image, all channels of a pixel alike in their logits, which needs a `learned` one. Over a
             table that has a hue that draws cast shadows, but few of the grey parts of a moving arm, which `colour`
             draws too, so that the foreground never explains them.
+        shadow: how dark a cast shadow may make each pixel by itself, as a share of its colour; 1 is the paper's: none. A
+            pixel is as likely lit as it is shadowed (see `seen`).
 
     Raises:
         ValueError: there is no bias image to shade.
@@ -48,13 +64,14 @@ class Background(nn.Module):
         width: Count = 32,
         bias_image: Literal["none", "learned"] = "learned",
         change: Literal["colour", "shade"] = "colour",
+        shadow: Annotated[float, Field(gt=0, le=1)] = 1.0,
     ) -> None:
         super().__init__()
         if change == "shade" and bias_image == "none":
             raise ValueError(
                 "change = 'shade' needs a bias image to shade: set bias_image = 'learned' or change = 'colour'"
             )
-        self.change = change
+        self.change, self.shadow = change, shadow
         layers: list[nn.Module] = [conv_norm(4, width, kernel=5, stride=4)]
         self.image_size = image_size
         side = image_size // 4
@@ -92,6 +109,19 @@ class Background(nn.Module):
         first = standard_normal(z[:, :1]) if before is None else gaussian_from(self.transition(before[:, None]))
         later = gaussian_from(self.transition(z[:, :-1]))
         return Gaussian(*(torch.cat([a, b], dim=1) for a, b in zip(first, later, strict=True)))
+
+    def cast(
+        self, backdrop: Float[Tensor, "*batch 3 H W"], image: Float[Tensor, "*batch 3 H W"]
+    ) -> Float[Tensor, "*batch 3 H W"]:
+        """The decoded background with the image's cast shadows on it, if it may have any."""
+        return backdrop if self.shadow == 1 else shadowed(backdrop, image, self.shadow)
+
+    def seen(self, backdrop: Float[Tensor, "N 3 H W"], image: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N S 3 H W"]:
+        """What each pixel of the background may look like: as decoded and, if there are shadows, as the image has it.
+
+        Both, because shadows alone would let the decoded image become brighter at no cost.
+        """
+        return torch.stack([backdrop] if self.shadow == 1 else [backdrop, self.cast(backdrop, image)], dim=1)
 
     def decode(self, z: Float[Tensor, "N Z"]) -> Float[Tensor, "N 3 H W"]:
         """z_bg -> RGB in [0, 1]."""

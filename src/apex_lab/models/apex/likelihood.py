@@ -59,14 +59,14 @@ class _LogMixture(torch.autograd.Function):
             torch.addcmul(prior, by_object, by_object, value=-0.5 * precision_fg, out=by_object)
         else:
             by_object = by_object.square_().mul_(-0.5 * precision_fg).add_(prior)
-        by_background = (image - background).square_().mul_(-0.5 / sigma_bg**2)
-        by_background += (log_background - sigma_bg.log())[:, None]
-        highest = torch.maximum(by_object.amax(1), by_background)
+        by_background = (image[:, None] - background).square_().mul_(-0.5 / sigma_bg**2)
+        by_background += (log_background - sigma_bg.log() - math.log(background.shape[1]))[:, None, None]
+        highest = torch.maximum(by_object.amax(1), by_background.amax(1))
         shares = _exp_(by_object.sub_(highest[:, None]))
-        share_background = _exp_(by_background.sub_(highest))
-        total = shares.sum(1) + share_background
+        share_background = _exp_(by_background.sub_(highest[:, None]))
+        total = shares.sum(1) + share_background.sum(1)
         shares /= total[:, None]
-        share_background /= total
+        share_background /= total[:, None]
         ctx.save_for_backward(shares, share_background, image, objects, background)
         ctx.precision = (precision_fg, 1 / sigma_bg**2)
         return total.log_().add_(highest).sub_(0.5 * math.log(2 * math.pi))
@@ -75,15 +75,20 @@ class _LogMixture(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         shares, share_background, image, objects, background = ctx.saved_tensors
         precision_fg, precision_bg = ctx.precision
-        by_object, by_background = shares * grad[:, None], share_background * grad
-        to_log_objects, to_log_background = by_object.sum(2), by_background.sum(1)
+        by_object, by_background = shares * grad[:, None], share_background * grad[:, None]
+        to_log_objects, to_log_background = by_object.sum(2), by_background.sum((1, 2))
         if isinstance(precision_fg, float):
             to_objects = by_object.mul_(torch.sub(precision_fg * image[:, None], objects, alpha=precision_fg))
         else:
             to_objects = by_object.mul_(image[:, None] - objects).mul_(precision_fg)
-        to_background = by_background.mul_(image - background).mul_(precision_bg)
-        to_image = -(to_objects.sum(1) + to_background) if ctx.needs_input_grad[0] else None
+        to_background = by_background.mul_(image[:, None] - background).mul_(precision_bg)
+        to_image = -(to_objects.sum(1) + to_background.sum(1)) if ctx.needs_input_grad[0] else None
         return to_image, to_log_objects, to_objects, to_log_background, to_background, None, None
+
+
+def _mean_density(logs: Float[Tensor, "N S ..."]) -> Float[Tensor, "N ..."]:
+    """Log of the mean of S densities that are given by their logs."""
+    return logs.squeeze(1) if logs.shape[1] == 1 else logs.logsumexp(1) - math.log(logs.shape[1])
 
 
 def _scaled(sigma: Tensor, scale: Tensor | None) -> Tensor:
@@ -100,7 +105,7 @@ class Likelihood(ABC):
         log_objects: Float[Tensor, "N K H W"],
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
-        background: Float[Tensor, "N 3 H W"],
+        background: Float[Tensor, "N S 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, " N"]:
@@ -111,7 +116,7 @@ class Likelihood(ABC):
             log_objects: log masks of the objects; -inf where a mask is zero.
             objects: their means, RGB in [0, 1].
             log_background: log mask of the background; finite.
-            background: its mean.
+            background: its means: S images, each pixel as likely like one as like the other; the paper has one.
             scale_fg, scale_bg: factors of sigma_fg and sigma_bg; None leaves them. No gradient goes there.
         """
 
@@ -139,7 +144,7 @@ class MixtureLikelihood(Likelihood):
         log_objects: Float[Tensor, "N K H W"],
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
-        background: Float[Tensor, "N 3 H W"],
+        background: Float[Tensor, "N S 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, " N"]:
@@ -148,7 +153,7 @@ class MixtureLikelihood(Likelihood):
             args = (image, log_objects, objects, log_background, background, sigma_fg, sigma_bg)
             return _LogMixture.apply(*args).flatten(1).sum(1)
         by_object = log_normal(image[:, None], objects, sigma_fg).sum(2)
-        by_background = log_normal(image, background, sigma_bg).sum(1)
+        by_background = _mean_density(log_normal(image[:, None], background, sigma_bg).sum(2))
         # One sum over all components: over the objects alone it has no gradient where all their masks are zero.
         parts = torch.cat([by_object + log_objects, (by_background + log_background)[:, None]], dim=1)
         return torch.logsumexp(parts, dim=1).flatten(1).sum(1)
@@ -161,6 +166,7 @@ class MixtureLikelihood(Likelihood):
         background: Bool[Tensor, " K"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
+        shadowed: Float[Tensor, "N K 3 H W"] | None = None,
     ) -> Float[Tensor, "N K H W"]:
         """p(component | pixel), the posterior under Eq. 1: m_k N(x; mu_k, sigma_k^2) over its sum over components.
 
@@ -172,13 +178,16 @@ class MixtureLikelihood(Likelihood):
             means: their images, RGB in [0, 1].
             background: which components have the background's standard deviation.
             scale_fg, scale_bg: as in `__call__`.
+            shadowed: what pixels of each component are as likely like as `means`; None: `means` alone.
         """
         sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
         sigma = torch.where(background, sigma_bg, sigma_fg)[:, None, None, None]
-        each = log_normal(image[:, None], means, sigma)
+        images = torch.stack([means] if shadowed is None else [means, shadowed], dim=1)
+        each = log_normal(image[:, None, None], images, sigma)
         log_masks = masks.log()[:, :, None]
         if self.mixture_over == "pixel":
-            return (log_masks + each.sum(2, keepdim=True)).softmax(1).squeeze(2)
+            return (log_masks + _mean_density(each.sum(3, keepdim=True))).softmax(1).squeeze(2)
+        each = _mean_density(each)
         return (log_masks + each).softmax(1).mean(2)
 
 
@@ -187,7 +196,7 @@ class GaussianLikelihood(Likelihood):
 
     Args:
         sigma: standard deviation in units of RGB in [0, 1]; the paper names none, default sigma_fg. So it is what
-            `scale_fg` multiplies; there is no sigma_bg.
+            `scale_fg` multiplies; there is no sigma_bg. It blends the last of the background's images.
     """
 
     def __init__(self, sigma: Sigma = 0.1) -> None:
@@ -199,10 +208,10 @@ class GaussianLikelihood(Likelihood):
         log_objects: Float[Tensor, "N K H W"],
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
-        background: Float[Tensor, "N 3 H W"],
+        background: Float[Tensor, "N S 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, " N"]:
-        blend = (log_objects.exp()[:, :, None] * objects).sum(1) + log_background.exp()[:, None] * background
+        blend = (log_objects.exp()[:, :, None] * objects).sum(1) + log_background.exp()[:, None] * background[:, -1]
         sigma = _scaled(image.new_full((), self.sigma), scale_fg)
         return log_normal(image, blend, sigma).flatten(1).sum(1)

@@ -17,6 +17,7 @@ from apex_lab.models.apex.foresight import NoiseOfFrames, Plan, planned
 from apex_lab.models.apex.glimpses import Glimpses
 from apex_lab.models.apex.likelihood import Likelihood, MixtureLikelihood
 from apex_lab.models.apex.masks import MaskNormalisation, Masks, blended
+from apex_lab.models.apex.merging import merged
 from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, loose_windows, mask_entropy
 from apex_lab.models.apex.objects import (
     Appearance,
@@ -89,6 +90,7 @@ class Apex(SceneModel):
             before masks have shapes, instead of growing over everything.
         start_std: standard deviation of q(z_what) at the start of training. A narrow one lets codes reach the decoders
             before noise drowns them; under the inclusive KL it costs 1 / (2 std^2) nats per dimension and object.
+        merges: how often per frame two proposals of discovery may become one (see merging.py); the paper's is 0.
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy", "loose_windows")
@@ -127,6 +129,7 @@ class Apex(SceneModel):
         start_presence: Share = 0.1,
         start_mask: float = 0.0,
         start_std: Positive = 0.5,
+        merges: Annotated[int, Field(ge=0)] = 0,
     ) -> None:
         super().__init__()
         if image_size % 32 or (image_size // encoder.stride) % grid:
@@ -140,6 +143,7 @@ class Apex(SceneModel):
         self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
         self.input_size = (image_size, image_size)
         self.render_top = min(render_top or grid**2, grid**2)
+        self.merges = merges
         self.has_posterior = isinstance(likelihood, MixtureLikelihood)
         self.direction, self.keep_threshold = kl, keep_threshold
         self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
@@ -189,8 +193,8 @@ class Apex(SceneModel):
         )
         plan = self._plan(memory, features, context.schedule, noise)
         with record_function("discovery"):
-            found = self._proposed(features, look_at, plan)
-            alphas = self._alpha(found.what)
+            found = self._proposed(features, look_at, plan, video.flatten(0, 1), context.schedule)
+            alphas = self.alpha(found.what)
         with record_function("loop over time"):
             shape = (video.shape[0], video.shape[1])
             claims = self._claims(alphas, found.place, plan, shape)
@@ -219,15 +223,47 @@ class Apex(SceneModel):
             scene.background,
             context.schedule["sigma_fg_scale"],
             context.schedule["sigma_bg_scale"],
+            None if self.background.shadow == 1 else self._shadowed(scene, video).flatten(0, 1),
         )
         return found.unflatten(0, video.shape[:2])
 
-    def _alpha(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch g g"]:
+    def _shadowed(self, scene: Scene, video: Float[Tensor, "B T 3 H W"]) -> Float[Tensor, "B T K 3 H W"]:
+        """The components' images with cast shadows on that of the background."""
+        assert scene.means is not None
+        cast = self.background.cast(scene.means, video[:, :, None].expand_as(scene.means))
+        return torch.where(scene.background[:, None, None, None], cast, scene.means)
+
+    def alpha(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch g g"]:
+        """Mask logits, as `MaskNormalisation` takes them."""
         raw = self.mask_decoder(what.reshape(-1, what.shape[-1]))
         return self.masks.logits(raw).reshape(*what.shape[:-1], *raw.shape[-2:])
 
-    def _paster(self, place: Float[Tensor, "*batch 4"], glimpse: int) -> Paster:
+    def colours(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch 3 g g"]:
+        """RGB in [0, 1]."""
+        return torch.sigmoid(self.colour_decoder(what.reshape(-1, what.shape[-1]))).unflatten(0, what.shape[:-1])
+
+    def paster(self, place: Float[Tensor, "*batch 4"], glimpse: int) -> Paster:
+        """Pastes glimpses into images through the windows at these places."""
         return Paster(window_of(place), glimpse, self.image_size)
+
+    def log_likelihood(
+        self,
+        images: Float[Tensor, "N 3 H W"],
+        masks: Masks,
+        means: Float[Tensor, "N n 3 H W"],
+        backdrop: Float[Tensor, "N 3 H W"],
+        schedule: Schedule,
+    ) -> Float[Tensor, " N"]:
+        """log p(x | masks, means) of N frames in nats."""
+        return self.likelihood(
+            images,
+            masks.log_objects,
+            means,
+            masks.log_background,
+            self.background.seen(backdrop, images),
+            schedule["sigma_fg_scale"],
+            schedule["sigma_bg_scale"],
+        )
 
     def _plan(self, memory: Memory, features: Tensor, schedule: Schedule, noise: Noise | None) -> Plan:
         """What the pass works on: on a CPU, in training, as little as it can."""
@@ -236,13 +272,19 @@ class Apex(SceneModel):
         sizes = (self.discovery.grid**2, self.max_objects, self.appearance.what)
         return planned(noise, memory.carried_on, features.shape[1], sizes, schedule, features)
 
-    def _proposed(self, features: Tensor, look_at: Tensor, plan: Plan) -> Proposals:
+    def _proposed(
+        self, features: Tensor, look_at: Tensor, plan: Plan, images: Tensor, schedule: Schedule
+    ) -> Proposals:
         """Discovery's proposals in all frames where it may find something, (F, D, ...)."""
         maps, noise, frames = [x.flatten(0, 1) for x in (features, look_at)], plan.noise, plan.opened
         if frames is not None:
             assert noise is not None
+            images = images.index_select(0, frames)
             maps, noise = [x.index_select(0, frames) for x in maps], NoiseOfFrames(noise, frames, len(maps[0]))
-        return self.discovery(*maps, self.glimpses, self.appearance, noise)
+        found = self.discovery(*maps, self.glimpses, self.appearance, noise)
+        for _ in range(self.merges):
+            found = merged(self, found, images, maps[1], schedule)
+        return found
 
     def _roll_out(
         self, frames: list[Frame], claims: list[Claims | None], memory: Memory, schedule: Schedule, noise: Noise | None
@@ -266,7 +308,7 @@ class Apex(SceneModel):
                     before = few
                     if slots is not None:
                         before, posterior = spread(few, posterior, slots, valid)
-                    few_alpha = None if claimed is None else self._alpha(few.what)
+                    few_alpha = None if claimed is None else self.alpha(few.what)
                     followed_masks.append(FollowedMasks(few.what, few_alpha, slots))
             else:
                 before, posterior = self.propagation.nothing(state, noise)
@@ -277,7 +319,7 @@ class Apex(SceneModel):
             if there and claimed is not None:
                 assert few_alpha is not None
                 with record_function("discovery"):
-                    paster = self._paster(few.place, few_alpha.shape[-1])
+                    paster = self.paster(few.place, few_alpha.shape[-1])
                     scope = claimed.of_videos(1 - self.masks.foreground(few_alpha, few.presence, paster))
                     context = claimed.put(context, context_probability(scope, claimed.masks))
                     unexplained = claimed.put(unexplained, scope_in_windows(scope, claimed.rows, claimed.columns))
@@ -349,7 +391,7 @@ class Apex(SceneModel):
         """Mask logits of all slots in all frames; those that the loop could do without are made here, at once."""
         waiting = [frame.what for frame in frames if frame is not None and frame.alpha is None]
         counts = [what.shape[1] for what in waiting]
-        made = iter(self._alpha(torch.cat(waiting, dim=1)).split(counts, dim=1) if waiting else ())
+        made = iter(self.alpha(torch.cat(waiting, dim=1)).split(counts, dim=1) if waiting else ())
         found = []
         for frame in frames:
             if frame is None:
@@ -369,7 +411,7 @@ class Apex(SceneModel):
         size = part_size(max(1, len(alphas)), alphas.shape[1] * self.image_size**2, place)
         found = []
         for alpha, where in zip(*(x.split(size) for x in (alphas, place)), strict=True):
-            paster = self._paster(where, alpha.shape[-1])
+            paster = self.paster(where, alpha.shape[-1])
             found.append((self.masks.claim(alpha, paster), *paster.inside()))
         claims = [joined(parts) for parts in zip(*found, strict=True)]
         if which is None:
@@ -426,7 +468,7 @@ class Apex(SceneModel):
         drawn = [x.flatten(0, 1) for x in (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)]
         parts = parts_of(drawn[2], 3 * self.image_size**2, video)
         seen = [Drawn(*map(part.of_components, drawn)) for part in parts]
-        pasters = [self._paster(part.place, part.alpha.shape[-1]) for part in seen]
+        pasters = [self.paster(part.place, part.alpha.shape[-1]) for part in seen]
         masks = [
             self.masks.compose(part.alpha, part.presence, part.valid, paster)
             for part, paster in zip(seen, pasters, strict=True)
@@ -480,22 +522,13 @@ class Apex(SceneModel):
     ) -> Picture:
         """Appearance, likelihood and mask entropy of a part's N frames, whose masks are known."""
         image, backdrop = part.of_frames(images), part.of_frames(backdrops)
-        colours = torch.sigmoid(self.colour_decoder(seen.what.flatten(0, 1))).unflatten(0, seen.presence.shape)
-        means = paster.each(colours)  # (N, n, 3, H, W)
+        means = paster.each(self.colours(seen.what))  # (N, n, 3, H, W)
         with record_function("likelihood"):
-            log_likelihood = self.likelihood(
-                image,
-                masks.log_objects,
-                means,
-                masks.log_background,
-                backdrop,
-                context.schedule["sigma_fg_scale"],
-                context.schedule["sigma_bg_scale"],
-            )
+            log_likelihood = self.log_likelihood(image, masks, means, backdrop, context.schedule)
         return Picture(
             part.at(masks.objects, source),
             masks.foreground,
-            blended(masks.objects, means, masks.background, backdrop),
+            blended(masks.objects, means, masks.background, self.background.cast(backdrop, image)),
             log_likelihood,
             mask_entropy(masks),
             torch.zeros_like(log_likelihood)

@@ -1,0 +1,207 @@
+"""Pieces of one thing that discovery proposes apart become one proposal where that raises the bound. Not in the paper.
+
+Cells propose alone, so a large thing is often proposed in halves by two cells, and no gradient leads from two good
+halves to one whole: every step on the way draws worse. The bound itself knows: with the two halves' codes replaced by
+one, read off the window around both, it rises where they are one thing and falls where they are two. So it is asked.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from apex_lab.models.apex.masks import Masks
+from apex_lab.models.apex.objects import Proposals
+from apex_lab.models.apex.windows import window_of
+from apex_lab.nn.distributions import Gaussian, kl_bernoulli, kl_gaussian, standard_normal
+from apex_lab.nn.slots import gather_slots, may_look
+
+if TYPE_CHECKING:
+    from apex_lab.models.apex.model import Apex
+    from apex_lab.scene import Schedule
+
+TOUCHING = 4.0
+"""Pixels along which two masks have to meet to be judged."""
+
+MARGIN = 1.25
+"""Size of a window around two masks, of their extent."""
+
+
+class Pairs(NamedTuple):
+    """V pairs of components, each of one of F frames; the first is the larger one.
+
+    frame (V,): of which frame. first, second (V,): which of its n components. valid (V,): they touch.
+    place (V, 4): the window around both.
+    """
+
+    frame: Int[Tensor, " V"]
+    first: Int[Tensor, " V"]
+    second: Int[Tensor, " V"]
+    valid: Bool[Tensor, " V"]
+    place: Float[Tensor, "V 4"]
+
+
+class Known(NamedTuple):
+    """What of the n likeliest proposals of F frames is needed to judge them.
+
+    top (F, n): their cells. there (F, n): present. what, place, alpha (F, n, ...): codes, places, mask logits.
+    cost, stay (F, n): nats of their z_what and z_pres.
+    """
+
+    top: Tensor
+    there: Bool[Tensor, "F n"]
+    what: Tensor
+    place: Tensor
+    alpha: Tensor
+    cost: Tensor
+    stay: Tensor
+
+
+def touching(masks: Float[Tensor, "F n H W"], there: Bool[Tensor, "F n"], most: int) -> Pairs:
+    """The pairs of each frame that share the longest rims; on a CPU only those that touch, elsewhere `most` each."""
+    n = masks.shape[1]
+    shared = F.max_pool2d(masks, 3, 1, 1).flatten(2) @ masks.flatten(2).transpose(1, 2)
+    a, b = torch.triu_indices(n, n, 1, device=masks.device)
+    length = torch.minimum(shared, shared.transpose(1, 2))[:, a, b] * (there[:, a] & there[:, b])
+    length, which = length.topk(min(most, len(a)), dim=1)
+    frame = torch.arange(len(masks), device=masks.device)[:, None].expand_as(which)
+    frame, a, b, valid = (x.flatten() for x in (frame, a[which], b[which], length > TOUCHING))
+    if may_look(masks):
+        chosen = valid.nonzero().squeeze(1)
+        frame, a, b, valid = (x.index_select(0, chosen) for x in (frame, a, b, valid))
+    area = masks.sum((-2, -1))
+    larger = area[frame, a] >= area[frame, b]
+    first, second = torch.where(larger, a, b), torch.where(larger, b, a)
+    return Pairs(frame, first, second, valid, around(masks[frame, first] + masks[frame, second] > 0.5))
+
+
+def around(pixels: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4"]:
+    """Place of the window around pixels, with a margin; arbitrary where there are none."""
+    size, centre = [], []
+    for line in (pixels.any(-1), pixels.any(-2)):
+        n = line.shape[-1]
+        low = line.to(torch.uint8).argmax(-1)
+        high = n - line.flip(-1).to(torch.uint8).argmax(-1)
+        size.append((MARGIN * (high - low) / n).clamp(2 / n, 0.95))
+        centre.append((high + low) / n - 1)
+    return torch.cat([torch.logit(torch.stack(size, -1)), torch.stack(centre, -1)], dim=-1)
+
+
+def merged(
+    model: Apex,
+    found: Proposals,
+    images: Float[Tensor, "F 3 H W"],
+    source: Float[Tensor, "F C h w"],
+    schedule: Schedule,
+    most: int = 4,
+) -> Proposals:
+    """The proposals of F frames, in each of them at most one pair replaced by one object.
+
+    Args:
+        model: what draws and judges.
+        found: (F, D, ...).
+        images, source: the frames, and where glimpses are cut from.
+        schedule: as the model is given it.
+        most: pairs of a frame that are judged.
+    """
+    with torch.no_grad():
+        known = _known(model, found, schedule)
+        alone = _composed(model, known.alpha, known.place, known.there)
+        pairs = touching(alone.objects, known.there, most)
+    if not len(pairs.frame):
+        return found
+    code = model.glimpses.look(source[pairs.frame], window_of(pairs.place)[:, None]).squeeze(1)
+    nothing = code.new_zeros(len(code), model.appearance.what), code.new_zeros(len(code), model.hidden)
+    q_what, hidden = model.appearance(code, *nothing)
+    with torch.no_grad():
+        gain = _gain(model, images, schedule, known, alone, pairs, q_what).masked_fill(~pairs.valid, -torch.inf)
+        best = gain.new_zeros(len(images)).scatter_reduce(0, pairs.frame, gain, "amax")
+        chosen = (gain > 0) & (gain == best[pairs.frame])
+    return _replaced(found, known.top, pairs, chosen, q_what, hidden)
+
+
+def _replaced(
+    found: Proposals, top: Tensor, pairs: Pairs, chosen: Bool[Tensor, " V"], q_what: Gaussian, hidden: Tensor
+) -> Proposals:
+    """The proposals with the chosen pairs' first ones replaced and their second ones gone."""
+    frames, cells = found.prob.shape
+    spot, gone = (pairs.frame * cells + top[pairs.frame, x] for x in (pairs.first, pairs.second))
+    if may_look(found.prob):
+        rows = chosen.nonzero().squeeze(1)
+        spot, gone = spot[rows], gone[rows]
+    else:  # those that are not chosen go to a row of their own, which is dropped
+        rows = torch.arange(len(chosen), device=spot.device)
+        spot, gone = (torch.where(chosen, x, frames * cells) for x in (spot, gone))
+
+    def put(old: Float[Tensor, "F D C"], new: Float[Tensor, "V C"]) -> Float[Tensor, "F D C"]:
+        flat = torch.cat([old.flatten(0, 1), old.new_zeros(1, old.shape[2])])
+        return flat.index_copy(0, spot, new[rows])[:-1].unflatten(0, (frames, cells))
+
+    belief = Gaussian(put(found.q_what.mean, q_what.mean), put(found.q_what.std, q_what.std))
+    noise = (found.what - found.q_what.mean) / found.q_what.std  # what the cell's own sample was drawn with
+    left = torch.cat([torch.ones_like(found.prob).flatten(), found.prob.new_zeros(1)])
+    left = left.index_fill(0, gone, 0.0)[:-1].view_as(found.prob)
+    return Proposals(
+        found.q_where,
+        belief,
+        belief.mean + belief.std * noise,
+        put(found.place, pairs.place),
+        found.prob * left,
+        put(found.hidden_what, hidden),
+    )
+
+
+def _known(model: Apex, found: Proposals, schedule: Schedule) -> Known:
+    prob, top = found.prob.topk(min(model.render_top, found.prob.shape[1]), dim=1)
+    what = gather_slots(found.q_what.mean, top)
+    cost = kl_gaussian(found.q_what, standard_normal(found.q_what.mean))
+    return Known(
+        top,
+        prob > 0.5,
+        what,
+        gather_slots(found.place, top),
+        model.alpha(what),
+        gather_slots(cost, top),
+        kl_bernoulli(prob, schedule["discovery_presence"]),
+    )
+
+
+def _composed(model: Apex, alpha: Tensor, place: Tensor, there: Tensor) -> Masks:
+    return model.masks.compose(alpha, there.to(alpha.dtype), there, model.paster(place, alpha.shape[-1]))
+
+
+def _means(model: Apex, what: Float[Tensor, "*batch Z"], place: Float[Tensor, "*batch 4"]) -> Tensor:
+    colours = model.colours(what)
+    return model.paster(place, colours.shape[-1]).each(colours)
+
+
+def _gain(
+    model: Apex, images: Tensor, schedule: Schedule, known: Known, alone: Masks, pairs: Pairs, q_what: Gaussian
+) -> Float[Tensor, " V"]:
+    """By how much the bound rises for each pair, in nats, but for its z_where, which costs a few."""
+    frame, first, second = pairs.frame, pairs.first, pairs.second
+    backdrop = model.background.decode(model.background.posterior(alone.background, images).mean)
+    means = _means(model, known.what, known.place)
+    before = model.log_likelihood(images, alone, means, backdrop, schedule)
+
+    own = torch.arange(known.there.shape[1], device=frame.device)
+
+    def joint(old: Float[Tensor, "F n ..."], new: Float[Tensor, "V ..."]) -> Float[Tensor, "V n ..."]:
+        here = (own == first[:, None]).view(*first.shape, -1, *[1] * (new.dim() - 1))
+        return torch.where(here, new[:, None], old[frame])
+
+    left = known.there[frame] & (own != second[:, None])
+    alpha, place = joint(known.alpha, model.alpha(q_what.mean)), joint(known.place, pairs.place)
+    after = model.log_likelihood(
+        images[frame],
+        _composed(model, alpha, place, left),
+        joint(means, _means(model, q_what.mean, pairs.place)),
+        backdrop[frame],
+        schedule,
+    )
+    saved = known.cost[frame, first] + known.cost[frame, second] + known.stay[frame, second]
+    return after - before[frame] + saved - kl_gaussian(q_what, standard_normal(q_what.mean))
