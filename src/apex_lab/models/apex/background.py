@@ -22,7 +22,7 @@ BRIGHTEST = math.log(2)
 
 
 def shadowed(
-    backdrop: Float[Tensor, "*batch 3 H W"], image: Float[Tensor, "*batch 3 H W"], darkest: float
+    backdrop: Float[Tensor, "*batch 3 H W"], image: Float[Tensor, "*batch 3 H W"], darkest: float | Float[Tensor, ""]
 ) -> Float[Tensor, "*batch 3 H W"]:
     """The background with every pixel as dark as the image has it, down to `darkest` times its colour. Not in the paper.
 
@@ -31,7 +31,7 @@ def shadowed(
     """
     with torch.no_grad():
         u = (image * backdrop).sum(-3, keepdim=True) / backdrop.square().sum(-3, keepdim=True).clamp_min(1e-6)
-        u.clamp_(darkest, 1.0)
+        u = torch.maximum(u, torch.as_tensor(darkest, dtype=u.dtype, device=u.device)).clamp_max_(1.0)
     return backdrop * u
 
 
@@ -111,17 +111,34 @@ class Background(nn.Module):
         return Gaussian(*(torch.cat([a, b], dim=1) for a, b in zip(first, later, strict=True)))
 
     def cast(
-        self, backdrop: Float[Tensor, "*batch 3 H W"], image: Float[Tensor, "*batch 3 H W"]
+        self,
+        backdrop: Float[Tensor, "*batch 3 H W"],
+        image: Float[Tensor, "*batch 3 H W"],
+        depth: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "*batch 3 H W"]:
-        """The decoded background with the image's cast shadows on it, if it may have any."""
-        return backdrop if self.shadow == 1 else shadowed(backdrop, image, self.shadow)
+        """The decoded background with the image's cast shadows on it, if it may have any.
 
-    def seen(self, backdrop: Float[Tensor, "N 3 H W"], image: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N S 3 H W"]:
+        Args:
+            backdrop: decoded.
+            image: RGB in [0, 1].
+            depth: in [0, 1], how far towards `shadow` they may go; None: all the way.
+        """
+        if self.shadow == 1:
+            return backdrop
+        darkest = self.shadow if depth is None else 1 - (1 - self.shadow) * depth
+        return shadowed(backdrop, image, darkest)
+
+    def seen(
+        self,
+        backdrop: Float[Tensor, "N 3 H W"],
+        image: Float[Tensor, "N 3 H W"],
+        depth: Float[Tensor, ""] | None = None,
+    ) -> Float[Tensor, "N S 3 H W"]:
         """What each pixel of the background may look like: as decoded and, if there are shadows, as the image has it.
 
         Both, because shadows alone would let the decoded image become brighter at no cost.
         """
-        return torch.stack([backdrop] if self.shadow == 1 else [backdrop, self.cast(backdrop, image)], dim=1)
+        return torch.stack([backdrop] if self.shadow == 1 else [backdrop, self.cast(backdrop, image, depth)], dim=1)
 
     def decode(self, z: Float[Tensor, "N Z"]) -> Float[Tensor, "N 3 H W"]:
         """z_bg -> RGB in [0, 1]."""

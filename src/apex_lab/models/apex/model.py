@@ -102,7 +102,9 @@ class Apex(SceneModel):
         "discover": (0.0, 1.0),
         "sigma_fg_scale": (0.01, 100.0),
         "sigma_bg_scale": (0.01, 100.0),
+        "shadow": (0.0, 1.0),
     }
+    optional_schedules = ("shadow",)
 
     def __init__(
         self,
@@ -223,14 +225,16 @@ class Apex(SceneModel):
             scene.background,
             context.schedule["sigma_fg_scale"],
             context.schedule["sigma_bg_scale"],
-            None if self.background.shadow == 1 else self._shadowed(scene, video).flatten(0, 1),
+            None if self.background.shadow == 1 else self._shadowed(scene, video, context.schedule).flatten(0, 1),
         )
         return found.unflatten(0, video.shape[:2])
 
-    def _shadowed(self, scene: Scene, video: Float[Tensor, "B T 3 H W"]) -> Float[Tensor, "B T K 3 H W"]:
+    def _shadowed(
+        self, scene: Scene, video: Float[Tensor, "B T 3 H W"], schedule: Schedule
+    ) -> Float[Tensor, "B T K 3 H W"]:
         """The components' images with cast shadows on that of the background."""
         assert scene.means is not None
-        cast = self.background.cast(scene.means, video[:, :, None].expand_as(scene.means))
+        cast = self.background.cast(scene.means, video[:, :, None].expand_as(scene.means), schedule.get("shadow"))
         return torch.where(scene.background[:, None, None, None], cast, scene.means)
 
     def alpha(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch g g"]:
@@ -260,7 +264,7 @@ class Apex(SceneModel):
             masks.log_objects,
             means,
             masks.log_background,
-            self.background.seen(backdrop, images),
+            self.background.seen(backdrop, images, schedule.get("shadow")),
             schedule["sigma_fg_scale"],
             schedule["sigma_bg_scale"],
         )
@@ -272,9 +276,7 @@ class Apex(SceneModel):
         sizes = (self.discovery.grid**2, self.max_objects, self.appearance.what)
         return planned(noise, memory.carried_on, features.shape[1], sizes, schedule, features)
 
-    def _proposed(
-        self, features: Tensor, look_at: Tensor, plan: Plan, images: Tensor, schedule: Schedule
-    ) -> Proposals:
+    def _proposed(self, features: Tensor, look_at: Tensor, plan: Plan, images: Tensor, schedule: Schedule) -> Proposals:
         """Discovery's proposals in all frames where it may find something, (F, D, ...)."""
         maps, noise, frames = [x.flatten(0, 1) for x in (features, look_at)], plan.noise, plan.opened
         if frames is not None:
@@ -528,7 +530,12 @@ class Apex(SceneModel):
         return Picture(
             part.at(masks.objects, source),
             masks.foreground,
-            blended(masks.objects, means, masks.background, self.background.cast(backdrop, image)),
+            blended(
+                masks.objects,
+                means,
+                masks.background,
+                self.background.cast(backdrop, image, context.schedule.get("shadow")),
+            ),
             log_likelihood,
             mask_entropy(masks),
             torch.zeros_like(log_likelihood)

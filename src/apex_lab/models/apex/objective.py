@@ -103,7 +103,7 @@ def loose_windows(
     masks: Float[Tensor, "N K H W"],
     place: Float[Tensor, "N K 4"],
     presence: Float[Tensor, "N K"],
-    margin: float = 1.25,
+    margin: float = 1.6,
 ) -> Float[Tensor, " N"]:
     """How much larger windows are than their own masks, and how far off their centres. Not in the paper.
 
