@@ -223,7 +223,7 @@ class Apex(SceneModel):
             scene.background,
             context.schedule["sigma_fg_scale"],
             context.schedule["sigma_bg_scale"],
-            None if self.background.shadow == 1 else self._shadowed(scene, video).flatten(0, 1),
+            None if self.background.shadow == 1 else self._shadowed(scene, video).flatten(0, 1).float(),
         )
         return found.unflatten(0, video.shape[:2])
 
@@ -272,9 +272,7 @@ class Apex(SceneModel):
         sizes = (self.discovery.grid**2, self.max_objects, self.appearance.what)
         return planned(noise, memory.carried_on, features.shape[1], sizes, schedule, features)
 
-    def _proposed(
-        self, features: Tensor, look_at: Tensor, plan: Plan, images: Tensor, schedule: Schedule
-    ) -> Proposals:
+    def _proposed(self, features: Tensor, look_at: Tensor, plan: Plan, images: Tensor, schedule: Schedule) -> Proposals:
         """Discovery's proposals in all frames where it may find something, (F, D, ...)."""
         maps, noise, frames = [x.flatten(0, 1) for x in (features, look_at)], plan.noise, plan.opened
         if frames is not None:
