@@ -2,7 +2,8 @@
 
 The same parts, weights, equations and loss terms, and as wide. What differs is how they are computed:
 
-- everything happens frame by frame inside the loop over time: encoder, discovery, rendering, likelihood, KL, result;
+- everything happens frame by frame inside the loop over time: encoder, discovery, merging, rendering, likelihood, KL,
+  result;
 - every crop and paste is an `affine_grid` and a `grid_sample` with a picture of its own for every component;
 - the mixture likelihood is a `logsumexp`, and it and p_context are differentiated by autograd;
 - `render_top=None` renders all cells of discovery, as the published equations do; a number renders as many as APEX.
@@ -10,6 +11,7 @@ The same parts, weights, equations and loss terms, and as wide. What differs is 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,6 +24,7 @@ from apex_lab.config import components
 from apex_lab.inference.predictor import joined
 from apex_lab.models.apex.likelihood import MixtureLikelihood, log_normal
 from apex_lab.models.apex.masks import ApexNormalisation, Masks
+from apex_lab.models.apex.merging import merged
 from apex_lab.models.apex.model import Apex
 from apex_lab.models.apex.objective import kl_terms
 from apex_lab.models.apex.objects import Objects, Proposals, context_probability, sample_presence, scope_in_windows
@@ -45,18 +48,17 @@ class PlainMixture(MixtureLikelihood):
         log_objects: Float[Tensor, "N K H W"],
         objects: Float[Tensor, "N K 3 H W"],
         log_background: Float[Tensor, "N H W"],
-        background: Float[Tensor, "N 3 H W"],
+        background: Float[Tensor, "N S 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, " N"]:
         sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
         by_object = log_normal(image[:, None], objects, sigma_fg)
-        by_background = log_normal(image, background, sigma_bg)
+        by_background = log_normal(image[:, None], background, sigma_bg)
         if self.mixture_over == "pixel":
-            by_object, by_background = by_object.sum(2, keepdim=True), by_background.sum(1, keepdim=True)
-        joint = torch.cat(
-            [by_object + log_objects[:, :, None], (by_background + log_background[:, None])[:, None]], dim=1
-        )
+            by_object, by_background = by_object.sum(2, keepdim=True), by_background.sum(2, keepdim=True)
+        each = (log_background - math.log(background.shape[1]))[:, None, None]
+        joint = torch.cat([by_object + log_objects[:, :, None], by_background + each], dim=1)
         return torch.logsumexp(joint, dim=1).flatten(1).sum(1)
 
 
@@ -94,7 +96,7 @@ class Straightforward(Apex):
             plain = self.likelihood
             self.likelihood = PlainMixture(plain.sigma_fg, plain.sigma_bg, plain.mixture_over)
 
-    def _paster(self, place: Float[Tensor, "*batch 4"], glimpse: int) -> GridPaster:
+    def paster(self, place: Float[Tensor, "*batch 4"], glimpse: int) -> GridPaster:
         return GridPaster(window_of(place), glimpse, self.image_size)
 
     def forward(self, video: Float[Tensor, "B T 3 H W"], context: Context) -> Scene:
@@ -107,6 +109,8 @@ class Straightforward(Apex):
         noise = context.noise if self.training else None
         look_at, follow_in, features = self._sources(video, i, memory)
         found = self.discovery(features[:, 0], look_at, self.glimpses, self.appearance, noise)
+        for _ in range(self.merges):
+            found = merged(self, found, video[:, i], look_at, context.schedule)
         proposals = found.over_time((len(video), 1), None)
         step = self._infer(look_at, follow_in, proposals, memory, context.schedule, noise)
         return self._render(video[:, i : i + 1], proposals, step, memory, context, noise)
@@ -144,9 +148,9 @@ class Straightforward(Apex):
             temperature,
             noise,
         )
-        alpha, alphas = self._alpha(before.what), self._alpha(proposals.what[:, 0])
-        scope = 1 - self.masks.foreground(alpha, before.presence, self._paster(before.place, alpha.shape[-1]))
-        paster = self._paster(proposals.place[:, 0], alphas.shape[-1])
+        alpha, alphas = self.alpha(before.what), self.alpha(proposals.what[:, 0])
+        scope = 1 - self.masks.foreground(alpha, before.presence, self.paster(before.place, alpha.shape[-1]))
+        paster = self.paster(proposals.place[:, 0], alphas.shape[-1])
         claims = self.masks.claim(alphas, paster)
         [cells] = frames_of(look_at[:, None], follow_in[:, None], proposals, alphas[:, None])
 
@@ -199,7 +203,7 @@ class Straightforward(Apex):
         alpha, presence, valid, place, what = (
             x[:, 0] for x in (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)
         )
-        paster = self._paster(place, alpha.shape[-1])
+        paster = self.paster(place, alpha.shape[-1])
         masks = self.masks.compose(alpha, presence, valid, paster)
         backdrop, kl_background = self._backdrop(frame[:, 0], masks, memory, noise)
         seen = Drawn(alpha, presence, valid, place, what)

@@ -139,7 +139,7 @@ def propose(model: Apex) -> Proposals:
 def everything() -> Iterator[None]:
     """Nothing is left out that holds nothing, as on a GPU."""
     with contextlib.ExitStack() as stack:
-        for module in ("nn.slots", "models.apex.model", "models.apex.parts"):
+        for module in ("nn.slots", "models.apex.model", "models.apex.parts", "models.apex.merging"):
             stack.enter_context(mock.patch(f"apex_lab.{module}.may_look", return_value=False))
         yield
 

@@ -99,7 +99,7 @@ def test_likelihood_through_masks_and_windows_by_finite_differences(
     def nats(raw: torch.Tensor, presence: torch.Tensor, windows: torch.Tensor, colours: torch.Tensor) -> torch.Tensor:
         paster = Paster(windows, 5, 8)
         out = masks.compose(masks.logits(raw), presence, valid, paster)
-        return likelihood(image, out.log_objects, paster.each(colours), out.log_background, back)
+        return likelihood(image, out.log_objects, paster.each(colours), out.log_background, back[:, None])
 
     assert (masks.compose(masks.logits(raw), presence, valid, Paster(windows, 5, 8)).foreground == 0).any()
     assert torch.autograd.gradcheck(nats, [x.requires_grad_() for x in (raw, presence, windows, colours)])
@@ -118,7 +118,9 @@ def test_a_missing_object_leaves_no_trace_in_any_gradient() -> None:
         paster = Paster(windows, 8, SIZE)
         out = masks.compose(masks.logits(raw), torch.tensor([[0.8, 0.0]]), valid, paster)
         means = torch.rand(1, 2, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(1))
-        loss = likelihood(image, out.log_objects, means, out.log_background, back).sum() + mask_entropy(out).sum()
+        loss = (
+            likelihood(image, out.log_objects, means, out.log_background, back[:, None]).sum() + mask_entropy(out).sum()
+        )
         (gradient,) = torch.autograd.grad(loss, raw)
         assert (gradient[0, 1] == 0).all()
         results.append((loss.detach(), gradient[0, 0]))

@@ -8,7 +8,8 @@ import torch
 from apex_lab.models.apex.likelihood import GaussianLikelihood, Likelihood, MixtureLikelihood, log_normal
 
 
-def case(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
+def case(dtype: torch.dtype = torch.float64, seen: int = 1) -> tuple[torch.Tensor, ...]:
+    """What a likelihood takes; `seen` images of the background."""
     g = torch.Generator().manual_seed(0)
     n, k, h, w = 2, 3, 4, 5
     share = torch.rand(n, k + 1, h, w, generator=g, dtype=torch.float64)
@@ -16,7 +17,7 @@ def case(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
     logs = (share / share.sum(1, keepdim=True)).log()
     image = torch.rand(n, 3, h, w, generator=g, dtype=torch.float64)
     means = torch.rand(n, k, 3, h, w, generator=g, dtype=torch.float64)
-    background = torch.rand(n, 3, h, w, generator=g, dtype=torch.float64)
+    background = torch.rand(n, seen, 3, h, w, generator=g, dtype=torch.float64)
     return tuple(x.to(dtype) for x in (image, logs[:, :k], means, logs[:, k], background))
 
 
@@ -24,11 +25,12 @@ def density(x: float, mean: float, sigma: float) -> float:
     return math.exp(-0.5 * ((x - mean) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi))
 
 
+@pytest.mark.parametrize("seen", [1, 2])
 @pytest.mark.parametrize("over", ["channel", "pixel"])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-10), (torch.float32, 1e-5)])
-def test_mixture_against_a_loop(over: str, dtype: torch.dtype, tolerance: float) -> None:
+def test_mixture_against_a_loop(over: str, dtype: torch.dtype, tolerance: float, seen: int) -> None:
     fg, bg = 0.4, 0.2
-    image, log_objects, means, log_background, background = case()
+    image, log_objects, means, log_background, background = case(seen=seen)
     want = torch.zeros(2, dtype=torch.float64)
     for n in range(2):
         for y in range(4):
@@ -40,19 +42,33 @@ def test_mixture_against_a_loop(over: str, dtype: torch.dtype, tolerance: float)
                         (log_objects[n, k, y, x].exp().item(), density(value, means[n, k, channel, y, x].item(), fg))
                         for k in range(3)
                     ]
-                    back = density(value, background[n, channel, y, x].item(), bg)
-                    p.append([*parts, (log_background[n, y, x].exp().item(), back)])
+                    share = log_background[n, y, x].exp().item() / seen
+                    back = [(share, density(value, one[channel, y, x].item(), bg)) for one in background[n]]
+                    p.append([*parts, *back])
                 if over == "channel":
                     want[n] += sum(math.log(sum(m * d for m, d in row)) for row in p)
                 else:
                     whole = zip(*p, strict=True)
                     want[n] += math.log(sum(rgb[0][0] * math.prod(d for _, d in rgb) for rgb in whole))
-    got = MixtureLikelihood(fg, bg, over)(*case(dtype))  # type: ignore[arg-type]
+    got = MixtureLikelihood(fg, bg, over)(*case(dtype, seen))  # type: ignore[arg-type]
     torch.testing.assert_close(got.double(), want, rtol=tolerance, atol=0)
 
 
-def test_mixture_is_stable_far_from_every_mean() -> None:
-    image, log_objects, means, log_background, background = case(torch.float32)
+@pytest.mark.parametrize("over", ["channel", "pixel"])
+def test_a_background_seen_twice_alike_is_seen_once(over: str) -> None:
+    likelihood = MixtureLikelihood(0.4, 0.2, over)  # type: ignore[arg-type]
+    found = []
+    for times in (1, 2):
+        leaves = [x.clone().requires_grad_() for x in case()]
+        out = likelihood(*leaves[:4], leaves[4].expand(-1, times, -1, -1, -1)).sum()
+        found.append([out, *torch.autograd.grad(out, leaves)])
+    for once, twice in zip(*found, strict=True):
+        torch.testing.assert_close(once, twice, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("seen", [1, 2])
+def test_mixture_is_stable_far_from_every_mean(seen: int) -> None:
+    image, log_objects, means, log_background, background = case(torch.float32, seen)
     image = (image + 50).requires_grad_()
     out = MixtureLikelihood()(image, log_objects, means, log_background, background)
     out.sum().backward()
@@ -61,11 +77,12 @@ def test_mixture_is_stable_far_from_every_mean() -> None:
     assert image.grad.isfinite().all()
 
 
-def test_gaussian_against_torch() -> None:
-    image, log_objects, means, log_background, background = case()
-    blend = (log_objects.exp()[:, :, None] * means).sum(1) + log_background.exp()[:, None] * background
+@pytest.mark.parametrize("seen", [1, 2])
+def test_gaussian_against_torch(seen: int) -> None:
+    image, log_objects, means, log_background, background = case(seen=seen)
+    blend = (log_objects.exp()[:, :, None] * means).sum(1) + log_background.exp()[:, None] * background[:, seen - 1]
     want = torch.distributions.Normal(blend, 0.3).log_prob(image).sum((1, 2, 3))
-    torch.testing.assert_close(GaussianLikelihood(0.3)(*case()), want)
+    torch.testing.assert_close(GaussianLikelihood(0.3)(*case(seen=seen)), want)
 
 
 def test_both_agree_where_one_component_owns_every_pixel() -> None:
@@ -77,16 +94,17 @@ def test_both_agree_where_one_component_owns_every_pixel() -> None:
     torch.testing.assert_close(a, b)
 
 
-def test_the_gradient_written_by_hand_equals_autograd_and_finite_differences() -> None:
-    inputs = [x.clone().requires_grad_(x.isfinite().all().item()) for x in case()]
+@pytest.mark.parametrize("seen", [1, 2])
+def test_the_gradient_written_by_hand_equals_autograd_and_finite_differences(seen: int) -> None:
+    inputs = [x.clone().requires_grad_(x.isfinite().all().item()) for x in case(seen=seen)]
     likelihood = MixtureLikelihood(0.4, 0.2)
     likelihood(*inputs).sum().backward()
     by_hand = [x.grad for x in inputs]
     again = [x.detach().clone().requires_grad_(x.requires_grad) for x in inputs]
     image, log_objects, means, log_background, background = again
     parts = log_normal(image[:, None], means, 0.4) + log_objects[:, :, None]
-    back = log_normal(image, background, 0.2) + log_background[:, None]
-    torch.logsumexp(torch.cat([parts, back[:, None]], 1), 1).sum().backward()
+    back = log_normal(image[:, None], background, 0.2) + log_background[:, None, None] - math.log(seen)
+    torch.logsumexp(torch.cat([parts, back], 1), 1).sum().backward()
     for got, want in zip(by_hand, [x.grad for x in again], strict=True):
         assert (got is None) == (want is None)
         if got is not None and want is not None:
@@ -105,7 +123,7 @@ def test_pixels_without_any_object_are_the_background_s_and_give_objects_no_grad
     leaves = [x.clone().requires_grad_() for x in (logs, means, torch.zeros(2, 4, 5), background)]
     out = likelihood(torch.zeros_like(image), *leaves)
     out.sum().backward()
-    want = torch.distributions.Normal(background, 0.04).log_prob(torch.zeros(())).sum((1, 2, 3))
+    want = torch.distributions.Normal(background[:, 0], 0.04).log_prob(torch.zeros(())).sum((1, 2, 3))
     torch.testing.assert_close(out, want)
     assert all(x.grad is not None and x.grad.isfinite().all() for x in leaves)
     assert (leaves[0].grad == 0).all()
@@ -145,55 +163,70 @@ def test_no_gradient_goes_to_the_scales(likelihood: Likelihood) -> None:
     assert all(scale.grad is None for scale in scales)
 
 
-def whole_case(dtype: torch.dtype = torch.float64) -> tuple[torch.Tensor, ...]:
+def whole_case(dtype: torch.dtype = torch.float64, seen: int = 1) -> tuple[torch.Tensor, ...]:
     """`case` with the background as the last component, as `responsibilities` takes it."""
-    image, log_objects, means, log_background, background = case(dtype)
+    image, log_objects, means, log_background, background = case(dtype, seen)
     masks = torch.cat([log_objects, log_background[:, None]], 1).exp()
-    return image, masks, torch.cat([means, background[:, None]], 1), torch.arange(4) == 3
+    return image, masks, torch.cat([means, background[:, :1]], 1), torch.arange(4) == 3
 
 
+def shadows(dtype: torch.dtype = torch.float64) -> torch.Tensor:
+    """What components are as likely like in `case` with two images of the background; objects like their means."""
+    _, _, means, _, background = case(dtype, 2)
+    return torch.cat([means, background[:, 1:]], 1)
+
+
+@pytest.mark.parametrize("seen", [1, 2])
 @pytest.mark.parametrize("over", ["channel", "pixel"])
-def test_responsibilities_against_bayes_rule_pixel_by_pixel(over: str) -> None:
-    image, masks, means, background = whole_case()
+def test_responsibilities_against_bayes_rule_pixel_by_pixel(over: str, seen: int) -> None:
+    image, masks, means, background = whole_case(seen=seen)
     likelihood = MixtureLikelihood(0.4, 0.2, over)  # type: ignore[arg-type]
-    got = likelihood.responsibilities(image, masks, means, background)
+    looks = [means] if seen == 1 else [means, shadows()]
+    got = likelihood.responsibilities(image, masks, means, background, shadowed=None if seen == 1 else looks[1])
     for n in range(2):
         for y in range(4):
             for x in range(5):
                 p = [
                     [
-                        density(image[n, c, y, x].item(), means[n, k, c, y, x].item(), 0.2 if k == 3 else 0.4)
-                        for c in range(3)
+                        [
+                            density(image[n, c, y, x].item(), look[n, k, c, y, x].item(), 0.2 if k == 3 else 0.4)
+                            for c in range(3)
+                        ]
+                        for look in looks
                     ]
                     for k in range(4)
                 ]
                 m = masks[n, :, y, x].tolist()
                 if over == "pixel":
-                    joint = [m[k] * math.prod(p[k]) for k in range(4)]
+                    joint = [m[k] * sum(math.prod(one) for one in p[k]) / seen for k in range(4)]
                     want = [one / sum(joint) for one in joint]
                 else:
-                    evidence = [sum(m[k] * p[k][c] for k in range(4)) for c in range(3)]
-                    want = [sum(m[k] * p[k][c] / evidence[c] for c in range(3)) / 3 for k in range(4)]
+                    mean = [[sum(one[c] for one in p[k]) / seen for c in range(3)] for k in range(4)]
+                    evidence = [sum(m[k] * mean[k][c] for k in range(4)) for c in range(3)]
+                    want = [sum(m[k] * mean[k][c] / evidence[c] for c in range(3)) / 3 for k in range(4)]
                 assert got[n, :, y, x].tolist() == pytest.approx(want, rel=1e-9, abs=1e-300)
     assert (got[:, 1] == 0).all()  # an absent component's
 
 
+@pytest.mark.parametrize("seen", [1, 2])
 @pytest.mark.parametrize(("over", "values"), [("channel", 3), ("pixel", 1)])
 @pytest.mark.parametrize("scales", [(), (torch.tensor(2.5), torch.tensor(0.75))])
 def test_responsibilities_are_what_the_likelihood_gains_by_a_larger_mask(
-    over: str, values: int, scales: tuple[torch.Tensor, ...]
+    over: str, values: int, scales: tuple[torch.Tensor, ...], seen: int
 ) -> None:
-    image, log_objects, means, log_background, background = case()
+    image, log_objects, means, log_background, background = case(seen=seen)
     leaves = [log_objects.requires_grad_(), log_background.requires_grad_()]
     likelihood = MixtureLikelihood(0.3, 0.1, over)  # type: ignore[arg-type]
     out = likelihood(image, leaves[0], means, leaves[1], background, *scales).sum()
     objects, back = torch.autograd.grad(out, leaves)
     gains = torch.cat([objects, back[:, None]], 1) / values
-    torch.testing.assert_close(likelihood.responsibilities(*whole_case(), *scales), gains)
+    found = likelihood.responsibilities(*whole_case(seen=seen), *scales, shadowed=None if seen == 1 else shadows())
+    torch.testing.assert_close(found, gains)
 
 
-def test_responsibilities_far_from_every_mean_still_sum_to_one() -> None:
+@pytest.mark.parametrize("shadowed", [None, shadows(torch.float32)], ids=["no shadows", "shadows"])
+def test_responsibilities_far_from_every_mean_still_sum_to_one(shadowed: torch.Tensor | None) -> None:
     image, masks, means, background = whole_case(torch.float32)
     for likelihood in (MixtureLikelihood(), MixtureLikelihood(0.1, 0.04, "pixel")):
-        found = likelihood.responsibilities(image + 50, masks, means, background)
+        found = likelihood.responsibilities(image + 50, masks, means, background, shadowed=shadowed)
         torch.testing.assert_close(found.sum(1), torch.ones(2, 4, 5))

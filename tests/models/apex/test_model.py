@@ -106,8 +106,9 @@ def test_permuting_components_permutes_masks_and_leaves_the_likelihood() -> None
         torch.testing.assert_close(a.objects[:, order], b.objects)
         torch.testing.assert_close(a.background, b.background)
         for likelihood in (MixtureLikelihood(), GaussianLikelihood()):
-            first = likelihood(image, a.log_objects, means, a.log_background, back)
-            torch.testing.assert_close(first, likelihood(image, b.log_objects, means[:, order], b.log_background, back))
+            first = likelihood(image, a.log_objects, means, a.log_background, back[:, None])
+            second = likelihood(image, b.log_objects, means[:, order], b.log_background, back[:, None])
+            torch.testing.assert_close(first, second)
 
 
 def test_permuting_slots_permutes_propagation() -> None:

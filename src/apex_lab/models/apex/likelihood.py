@@ -33,7 +33,7 @@ def _exp_(x: Tensor) -> Tensor:
 
 
 class _LogMixture(torch.autograd.Function):
-    """log sum_k exp(log_m_k + log N(x; mu_k, sigma_k)) per pixel and channel, with its gradient written by hand.
+    """log sum_k exp(log_m_k + log N(x; mu_k, sigma_k)) per pixel and channel or per pixel, with its gradient by hand.
 
     This is the largest computation of a training step: plain autograd keeps some ten tensors of the size of all
     components' images, this keeps the responsibilities alone.
@@ -49,18 +49,28 @@ class _LogMixture(torch.autograd.Function):
         background: Tensor,
         sigma_fg: Tensor,
         sigma_bg: Tensor,
+        whole: bool,
     ) -> Tensor:
-        """Shapes as in `Likelihood.__call__`, sigmas 0-dim -> log density (N, 3, H, W) in nats."""
+        """Shapes as in `Likelihood.__call__`, sigmas 0-dim -> log density in nats.
+
+        (N, 3, H, W), or, where whole colours are mixed, (N, 1, H, W).
+        """
         precision_fg: float | Tensor = 1 / sigma_fg**2
+        channels = image.shape[1] if whole else 1
         by_object = image[:, None] - objects
-        prior = (log_objects - sigma_fg.log())[:, :, None]
-        if may_look(image):  # with a number in place of a tensor, one pass in place of three
+        prior = (log_objects - channels * sigma_fg.log())[:, :, None]
+        if whole:
+            by_object = by_object.square_().sum(2, keepdim=True).mul_(-0.5 * precision_fg).add_(prior)
+        elif may_look(image):  # with a number in place of a tensor, one pass in place of three
             precision_fg = float(precision_fg)
             torch.addcmul(prior, by_object, by_object, value=-0.5 * precision_fg, out=by_object)
         else:
             by_object = by_object.square_().mul_(-0.5 * precision_fg).add_(prior)
-        by_background = (image[:, None] - background).square_().mul_(-0.5 / sigma_bg**2)
-        by_background += (log_background - sigma_bg.log() - math.log(background.shape[1]))[:, None, None]
+        by_background = (image[:, None] - background).square_()
+        if whole:
+            by_background = by_background.sum(2, keepdim=True)
+        by_background.mul_(-0.5 / sigma_bg**2)
+        by_background += (log_background - channels * sigma_bg.log() - math.log(background.shape[1]))[:, None, None]
         highest = torch.maximum(by_object.amax(1), by_background.amax(1))
         shares = _exp_(by_object.sub_(highest[:, None]))
         share_background = _exp_(by_background.sub_(highest[:, None]))
@@ -69,7 +79,7 @@ class _LogMixture(torch.autograd.Function):
         share_background /= total[:, None]
         ctx.save_for_backward(shares, share_background, image, objects, background)
         ctx.precision = (precision_fg, 1 / sigma_bg**2)
-        return total.log_().add_(highest).sub_(0.5 * math.log(2 * math.pi))
+        return total.log_().add_(highest).sub_(0.5 * channels * math.log(2 * math.pi))
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
@@ -77,13 +87,15 @@ class _LogMixture(torch.autograd.Function):
         precision_fg, precision_bg = ctx.precision
         by_object, by_background = shares * grad[:, None], share_background * grad[:, None]
         to_log_objects, to_log_background = by_object.sum(2), by_background.sum((1, 2))
+        if by_object.shape[2] != image.shape[1]:  # one share for all channels
+            by_object, by_background = by_object.expand_as(objects).clone(), by_background.expand_as(background).clone()
         if isinstance(precision_fg, float):
             to_objects = by_object.mul_(torch.sub(precision_fg * image[:, None], objects, alpha=precision_fg))
         else:
             to_objects = by_object.mul_(image[:, None] - objects).mul_(precision_fg)
         to_background = by_background.mul_(image[:, None] - background).mul_(precision_bg)
         to_image = -(to_objects.sum(1) + to_background.sum(1)) if ctx.needs_input_grad[0] else None
-        return to_image, to_log_objects, to_objects, to_log_background, to_background, None, None
+        return to_image, to_log_objects, to_objects, to_log_background, to_background, None, None, None
 
 
 def _mean_density(logs: Float[Tensor, "N S ..."]) -> Float[Tensor, "N ..."]:
@@ -149,14 +161,8 @@ class MixtureLikelihood(Likelihood):
         scale_bg: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, " N"]:
         sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
-        if self.mixture_over == "channel":
-            args = (image, log_objects, objects, log_background, background, sigma_fg, sigma_bg)
-            return _LogMixture.apply(*args).flatten(1).sum(1)
-        by_object = log_normal(image[:, None], objects, sigma_fg).sum(2)
-        by_background = _mean_density(log_normal(image[:, None], background, sigma_bg).sum(2))
-        # One sum over all components: over the objects alone it has no gradient where all their masks are zero.
-        parts = torch.cat([by_object + log_objects, (by_background + log_background)[:, None]], dim=1)
-        return torch.logsumexp(parts, dim=1).flatten(1).sum(1)
+        args = (image, log_objects, objects, log_background, background, sigma_fg, sigma_bg)
+        return _LogMixture.apply(*args, self.mixture_over == "pixel").flatten(1).sum(1)
 
     def responsibilities(
         self,

@@ -49,7 +49,7 @@ class Known(NamedTuple):
     """What of the n likeliest proposals of F frames is needed to judge them.
 
     top (F, n): their cells. there (F, n): present. what, place, alpha (F, n, ...): codes, places, mask logits.
-    cost, stay (F, n): nats of their z_what and z_pres.
+    cost, stay (F, n): nats of their z_what, and of their z_pres beyond those of an absent one's.
     """
 
     top: Tensor
@@ -76,16 +76,16 @@ def touching(masks: Float[Tensor, "F n H W"], there: Bool[Tensor, "F n"], most: 
     area = masks.sum((-2, -1))
     larger = area[frame, a] >= area[frame, b]
     first, second = torch.where(larger, a, b), torch.where(larger, b, a)
-    return Pairs(frame, first, second, valid, around(masks[frame, first] + masks[frame, second] > 0.5))
+    return Pairs(frame, first, second, valid, around(masks[frame, first] + masks[frame, second]))
 
 
-def around(pixels: Bool[Tensor, "V H W"]) -> Float[Tensor, "V 4"]:
-    """Place of the window around pixels, with a margin; arbitrary where there are none."""
+def around(mask: Float[Tensor, "V H W"]) -> Float[Tensor, "V 4"]:
+    """Place of the window around a mask's pixels, with a margin; arbitrary where it has none."""
     size, centre = [], []
-    for line in (pixels.any(-1), pixels.any(-2)):
+    for line in ((mask > 0.5).any(-1), (mask > 0.5).any(-2)):
         n = line.shape[-1]
-        low = line.to(torch.uint8).argmax(-1)
-        high = n - line.flip(-1).to(torch.uint8).argmax(-1)
+        low = line.to(torch.uint8).argmax(-1).to(mask.dtype)
+        high = n - line.flip(-1).to(torch.uint8).argmax(-1).to(mask.dtype)
         size.append((MARGIN * (high - low) / n).clamp(2 / n, 0.95))
         centre.append((high + low) / n - 1)
     return torch.cat([torch.logit(torch.stack(size, -1)), torch.stack(centre, -1)], dim=-1)
@@ -119,9 +119,17 @@ def merged(
     q_what, hidden = model.appearance(code, *nothing)
     with torch.no_grad():
         gain = _gain(model, images, schedule, known, alone, pairs, q_what).masked_fill(~pairs.valid, -torch.inf)
-        best = gain.new_zeros(len(images)).scatter_reduce(0, pairs.frame, gain, "amax")
-        chosen = (gain > 0) & (gain == best[pairs.frame])
+        chosen = best_of(gain, pairs.frame, len(images))
     return _replaced(found, known.top, pairs, chosen, q_what, hidden)
+
+
+def best_of(gain: Float[Tensor, " V"], frame: Int[Tensor, " V"], frames: int) -> Bool[Tensor, " V"]:
+    """Which pair of each frame gains most; none where no gain is positive, the first one of several alike."""
+    best = gain.new_zeros(frames).scatter_reduce(0, frame, gain, "amax")
+    alike = (gain > 0) & (gain == best[frame])
+    own = torch.arange(len(gain), device=gain.device)
+    first = own.new_full((frames,), len(gain)).scatter_reduce(0, frame, own.masked_fill(~alike, len(gain)), "amin")
+    return own == first[frame]
 
 
 def _replaced(
@@ -130,6 +138,8 @@ def _replaced(
     """The proposals with the chosen pairs' first ones replaced and their second ones gone."""
     frames, cells = found.prob.shape
     spot, gone = (pairs.frame * cells + top[pairs.frame, x] for x in (pairs.first, pairs.second))
+    noise = ((found.what - found.q_what.mean) / found.q_what.std).detach()  # what each cell's sample was drawn with
+    what = q_what.mean + q_what.std * noise.flatten(0, 1)[spot]
     if may_look(found.prob):
         rows = chosen.nonzero().squeeze(1)
         spot, gone = spot[rows], gone[rows]
@@ -139,16 +149,14 @@ def _replaced(
 
     def put(old: Float[Tensor, "F D C"], new: Float[Tensor, "V C"]) -> Float[Tensor, "F D C"]:
         flat = torch.cat([old.flatten(0, 1), old.new_zeros(1, old.shape[2])])
-        return flat.index_copy(0, spot, new[rows])[:-1].unflatten(0, (frames, cells))
+        return flat.index_copy(0, spot, new[rows].to(old.dtype))[:-1].unflatten(0, (frames, cells))
 
-    belief = Gaussian(put(found.q_what.mean, q_what.mean), put(found.q_what.std, q_what.std))
-    noise = (found.what - found.q_what.mean) / found.q_what.std  # what the cell's own sample was drawn with
     left = torch.cat([torch.ones_like(found.prob).flatten(), found.prob.new_zeros(1)])
     left = left.index_fill(0, gone, 0.0)[:-1].view_as(found.prob)
     return Proposals(
         found.q_where,
-        belief,
-        belief.mean + belief.std * noise,
+        Gaussian(put(found.q_what.mean, q_what.mean), put(found.q_what.std, q_what.std)),
+        put(found.what, what),
         put(found.place, pairs.place),
         found.prob * left,
         put(found.hidden_what, hidden),
@@ -159,6 +167,7 @@ def _known(model: Apex, found: Proposals, schedule: Schedule) -> Known:
     prob, top = found.prob.topk(min(model.render_top, found.prob.shape[1]), dim=1)
     what = gather_slots(found.q_what.mean, top)
     cost = kl_gaussian(found.q_what, standard_normal(found.q_what.mean))
+    stay, away = (kl_bernoulli(x, schedule["discovery_presence"]) for x in (prob, torch.zeros_like(prob)))
     return Known(
         top,
         prob > 0.5,
@@ -166,7 +175,7 @@ def _known(model: Apex, found: Proposals, schedule: Schedule) -> Known:
         gather_slots(found.place, top),
         model.alpha(what),
         gather_slots(cost, top),
-        kl_bernoulli(prob, schedule["discovery_presence"]),
+        stay - away,
     )
 
 

@@ -225,7 +225,9 @@ class Apex(SceneModel):
             scene.background,
             context.schedule["sigma_fg_scale"],
             context.schedule["sigma_bg_scale"],
-            None if self.background.shadow == 1 else self._shadowed(scene, video, context.schedule).flatten(0, 1),
+            None
+            if self.background.shadow == 1
+            else self._shadowed(scene, video, context.schedule).flatten(0, 1).float(),
         )
         return found.unflatten(0, video.shape[:2])
 
