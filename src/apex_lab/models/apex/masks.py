@@ -25,6 +25,10 @@ TINY = 1e-30
 """A mask below it is zero: its logarithm is -inf, and no gradient comes from it."""
 
 
+NEARLY = 1 - 1e-6
+"""The largest share of a bound whose inverse is taken."""
+
+
 class Masks(NamedTuple):
     """Masks of one set of components and of the background; logs are for the likelihood, shares for everything else.
 
@@ -61,6 +65,10 @@ class MaskNormalisation(ABC):
     @abstractmethod
     def logits(self, raw: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """Decoder output -> alpha, the glimpse that all other methods take."""
+
+    @abstractmethod
+    def raw(self, alpha: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """The decoder output that gives this alpha; bounded where alpha is as large as it can be."""
 
     @abstractmethod
     def foreground(
@@ -232,6 +240,10 @@ class ScalorNormalisation(MaskNormalisation):
     def logits(self, raw: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """alpha^s = sigmoid(CNN(z_what))."""
         return torch.sigmoid(raw)
+
+    def raw(self, alpha: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """The inverse of `logits`, within +-13.8."""
+        return torch.logit(alpha, eps=1 - NEARLY)
 
     def _warped(
         self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster

@@ -95,6 +95,7 @@ def merged(
     model: Apex,
     found: Proposals,
     images: Float[Tensor, "F 3 H W"],
+    evidence: Float[Tensor, "F E H W"] | None,
     source: Float[Tensor, "F C h w"],
     schedule: Schedule,
     most: int = 4,
@@ -104,12 +105,12 @@ def merged(
     Args:
         model: what draws and judges.
         found: (F, D, ...).
-        images, source: the frames, and where glimpses are cut from.
+        images, evidence, source: the frames, their pixels' features if masks see them, and where glimpses are cut from.
         schedule: as the model is given it.
         most: pairs of a frame that are judged.
     """
     with torch.no_grad():
-        known = _known(model, found, schedule)
+        known = _known(model, found, evidence, schedule)
         alone = _composed(model, known.alpha, known.place, known.there)
         pairs = touching(alone.objects, known.there, most)
     if not len(pairs.frame):
@@ -118,7 +119,9 @@ def merged(
     nothing = code.new_zeros(len(code), model.appearance.what), code.new_zeros(len(code), model.hidden)
     q_what, hidden = model.appearance(code, *nothing)
     with torch.no_grad():
-        gain = _gain(model, images, schedule, known, alone, pairs, q_what).masked_fill(~pairs.valid, -torch.inf)
+        gain = _gain(model, images, evidence, schedule, known, alone, pairs, q_what).masked_fill(
+            ~pairs.valid, -torch.inf
+        )
         chosen = best_of(gain, pairs.frame, len(images))
     return _replaced(found, known.top, pairs, chosen, q_what, hidden)
 
@@ -163,17 +166,17 @@ def _replaced(
     )
 
 
-def _known(model: Apex, found: Proposals, schedule: Schedule) -> Known:
+def _known(model: Apex, found: Proposals, evidence: Tensor | None, schedule: Schedule) -> Known:
     prob, top = found.prob.topk(min(model.render_top, found.prob.shape[1]), dim=1)
-    what = gather_slots(found.q_what.mean, top)
+    what, place = gather_slots(found.q_what.mean, top), gather_slots(found.place, top)
     cost = kl_gaussian(found.q_what, standard_normal(found.q_what.mean))
     stay, away = (kl_bernoulli(x, schedule["discovery_presence"]) for x in (prob, torch.zeros_like(prob)))
     return Known(
         top,
         prob > 0.5,
         what,
-        gather_slots(found.place, top),
-        model.alpha(what),
+        place,
+        model.sharpened(model.alpha(what), what, place, evidence, schedule),
         gather_slots(cost, top),
         stay - away,
     )
@@ -189,9 +192,16 @@ def _means(model: Apex, what: Float[Tensor, "*batch Z"], place: Float[Tensor, "*
 
 
 def _gain(
-    model: Apex, images: Tensor, schedule: Schedule, known: Known, alone: Masks, pairs: Pairs, q_what: Gaussian
+    model: Apex,
+    images: Tensor,
+    evidence: Tensor | None,
+    schedule: Schedule,
+    known: Known,
+    alone: Masks,
+    pairs: Pairs,
+    q_what: Gaussian,
 ) -> Float[Tensor, " V"]:
-    """By how much the bound rises for each pair, in nats, but for its z_where, which costs a few."""
+    """By how much the bound rises for each pair, with the price of a piece, in nats; z_where, a few nats, is left out."""
     frame, first, second = pairs.frame, pairs.first, pairs.second
     backdrop = model.background.decode(model.background.posterior(alone.background, images).mean)
     means = _means(model, known.what, known.place)
@@ -204,7 +214,14 @@ def _gain(
         return torch.where(here, new[:, None], old[frame])
 
     left = known.there[frame] & (own != second[:, None])
-    alpha, place = joint(known.alpha, model.alpha(q_what.mean)), joint(known.place, pairs.place)
+    union = model.sharpened(
+        model.alpha(q_what.mean)[:, None],
+        q_what.mean[:, None],
+        pairs.place[:, None],
+        None if evidence is None else evidence[frame],
+        schedule,
+    )
+    alpha, place = joint(known.alpha, union.squeeze(1)), joint(known.place, pairs.place)
     after = model.log_likelihood(
         images[frame],
         _composed(model, alpha, place, left),
@@ -213,4 +230,5 @@ def _gain(
         schedule,
     )
     saved = known.cost[frame, first] + known.cost[frame, second] + known.stay[frame, second]
+    saved = saved + model.piece_price * schedule.get("refinement", 1.0)
     return after - before[frame] + saved - kl_gaussian(q_what, standard_normal(q_what.mean))

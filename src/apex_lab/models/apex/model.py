@@ -34,6 +34,7 @@ from apex_lab.models.apex.objects import (
     spread,
 )
 from apex_lab.models.apex.parts import Part, in_order, parts_of
+from apex_lab.models.apex.pixels import PixelEvidence
 from apex_lab.models.apex.result import Drawn, Picture, scene_of, video_of
 from apex_lab.models.apex.rollout import (
     Claimed,
@@ -91,6 +92,8 @@ class Apex(SceneModel):
         start_std: standard deviation of q(z_what) at the start of training. A narrow one lets codes reach the decoders
             before noise drowns them; under the inclusive KL it costs 1 / (2 std^2) nats per dimension and object.
         merges: how often per frame two proposals of discovery may become one (see merging.py); the paper's is 0.
+        piece_price: nats that the second of two such proposals has to be worth beyond its own cost.
+        pixel_features: how many features of each pixel shift the mask logits (see pixels.py); the paper's is 0.
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy", "loose_windows")
@@ -102,9 +105,9 @@ class Apex(SceneModel):
         "discover": (0.0, 1.0),
         "sigma_fg_scale": (0.01, 100.0),
         "sigma_bg_scale": (0.01, 100.0),
-        "shadow": (0.0, 1.0),
+        "refinement": (0.0, 1.0),
     }
-    optional_schedules = ("shadow",)
+    optional_schedules = ("refinement",)
 
     def __init__(
         self,
@@ -132,6 +135,8 @@ class Apex(SceneModel):
         start_mask: float = 0.0,
         start_std: Positive = 0.5,
         merges: Annotated[int, Field(ge=0)] = 0,
+        piece_price: Annotated[float, Field(ge=0)] = 0.0,
+        pixel_features: Annotated[int, Field(ge=0)] = 0,
     ) -> None:
         super().__init__()
         if image_size % 32 or (image_size // encoder.stride) % grid:
@@ -145,7 +150,7 @@ class Apex(SceneModel):
         self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
         self.input_size = (image_size, image_size)
         self.render_top = min(render_top or grid**2, grid**2)
-        self.merges = merges
+        self.merges, self.piece_price = merges, piece_price
         self.has_posterior = isinstance(likelihood, MixtureLikelihood)
         self.direction, self.keep_threshold = kl, keep_threshold
         self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
@@ -161,6 +166,7 @@ class Apex(SceneModel):
         # Last, so that all other weights start at the same values whatever the glimpses are cut from.
         self.glimpses.build(encoder.features, hidden)
         self.mask_decoder.start_at(start_mask)
+        self.pixels = PixelEvidence(what, pixel_features) if pixel_features else None
 
     def initialise(self, statistics: Statistics) -> None:
         """Starts the background at the training set's median, if it has a bias image."""
@@ -179,7 +185,8 @@ class Apex(SceneModel):
                 `sigma_fg_scale` and `sigma_bg_scale`, what the likelihood's sigmas are multiplied by. A wide sigma_bg:
                 the background first learns what it can, such as cast shadows, before objects are asked to explain the
                 rest. A wide sigma_fg: while objects cannot be drawn well yet, two components of half an object gain
-                less likelihood over one of the whole than the second one costs.
+                less likelihood over one of the whole than the second one costs. `refinement` (may be missing:
+                1), how much of what is not the paper's counts: cast shadows, pixels in masks, the price of a piece.
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
@@ -195,7 +202,9 @@ class Apex(SceneModel):
         )
         plan = self._plan(memory, features, context.schedule, noise)
         with record_function("discovery"):
-            found = self._proposed(features, look_at, plan, video.flatten(0, 1), context.schedule)
+            images = video.flatten(0, 1)
+            evidence = self._evidence(images, context.schedule)
+            found = self._proposed(features, look_at, plan, images, evidence, context.schedule)
             alphas = self.alpha(found.what)
         with record_function("loop over time"):
             shape = (video.shape[0], video.shape[1])
@@ -207,7 +216,7 @@ class Apex(SceneModel):
                 steps, memory = self._roll_out(frames, claims, memory, context.schedule, plan.noise)
         with record_function("rendering"):
             return self._explain(
-                video, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z)
+                video, evidence, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z)
             )
 
     def posterior(
@@ -236,13 +245,37 @@ class Apex(SceneModel):
     ) -> Float[Tensor, "B T K 3 H W"]:
         """The components' images with cast shadows on that of the background."""
         assert scene.means is not None
-        cast = self.background.cast(scene.means, video[:, :, None].expand_as(scene.means), schedule.get("shadow"))
+        cast = self.background.cast(scene.means, video[:, :, None].expand_as(scene.means), schedule.get("refinement"))
         return torch.where(scene.background[:, None, None, None], cast, scene.means)
 
     def alpha(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch g g"]:
         """Mask logits, as `MaskNormalisation` takes them."""
         raw = self.mask_decoder(what.reshape(-1, what.shape[-1]))
         return self.masks.logits(raw).reshape(*what.shape[:-1], *raw.shape[-2:])
+
+    def _evidence(self, images: Float[Tensor, "F 3 H W"], schedule: Schedule) -> Float[Tensor, "F C H W"] | None:
+        """Features of pixels that masks may see; None where there are none."""
+        if self.pixels is None:
+            return None
+        bias = self.background.bias_image
+        if bias is None:
+            return self.pixels(images, images)
+        empty = torch.sigmoid(bias.detach()).expand_as(images)
+        return self.pixels(images, self.background.cast(empty, images, schedule.get("refinement")))
+
+    def sharpened(
+        self,
+        alpha: Float[Tensor, "N n g g"],
+        what: Float[Tensor, "N n Z"],
+        place: Float[Tensor, "N n 4"],
+        evidence: Float[Tensor, "N C H W"] | None,
+        schedule: Schedule,
+    ) -> Float[Tensor, "N n g g"]:
+        """Mask logits of components of N frames with what their pixels say."""
+        if self.pixels is None or evidence is None:
+            return alpha
+        shift = self.pixels.shifts(evidence, what, window_of(place), alpha.shape[-1])
+        return self.masks.logits(self.masks.raw(alpha) + shift * schedule.get("refinement", 1.0))
 
     def colours(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch 3 g g"]:
         """RGB in [0, 1]."""
@@ -266,7 +299,7 @@ class Apex(SceneModel):
             masks.log_objects,
             means,
             masks.log_background,
-            self.background.seen(backdrop, images, schedule.get("shadow")),
+            self.background.seen(backdrop, images, schedule.get("refinement")),
             schedule["sigma_fg_scale"],
             schedule["sigma_bg_scale"],
         )
@@ -278,16 +311,19 @@ class Apex(SceneModel):
         sizes = (self.discovery.grid**2, self.max_objects, self.appearance.what)
         return planned(noise, memory.carried_on, features.shape[1], sizes, schedule, features)
 
-    def _proposed(self, features: Tensor, look_at: Tensor, plan: Plan, images: Tensor, schedule: Schedule) -> Proposals:
+    def _proposed(
+        self, features: Tensor, look_at: Tensor, plan: Plan, images: Tensor, evidence: Tensor | None, schedule: Schedule
+    ) -> Proposals:
         """Discovery's proposals in all frames where it may find something, (F, D, ...)."""
         maps, noise, frames = [x.flatten(0, 1) for x in (features, look_at)], plan.noise, plan.opened
         if frames is not None:
             assert noise is not None
             images = images.index_select(0, frames)
+            evidence = None if evidence is None else evidence.index_select(0, frames)
             maps, noise = [x.index_select(0, frames) for x in maps], NoiseOfFrames(noise, frames, len(maps[0]))
         found = self.discovery(*maps, self.glimpses, self.appearance, noise)
         for _ in range(self.merges):
-            found = merged(self, found, images, maps[1], schedule)
+            found = merged(self, found, images, evidence, maps[1], schedule)
         return found
 
     def _roll_out(
@@ -460,6 +496,7 @@ class Apex(SceneModel):
     def _explain(
         self,
         video: Tensor,
+        evidence: Tensor | None,
         proposals: Proposals,
         steps: Step,
         context: Context,
@@ -474,8 +511,19 @@ class Apex(SceneModel):
         seen = [Drawn(*map(part.of_components, drawn)) for part in parts]
         pasters = [self.paster(part.place, part.alpha.shape[-1]) for part in seen]
         masks = [
-            self.masks.compose(part.alpha, part.presence, part.valid, paster)
-            for part, paster in zip(seen, pasters, strict=True)
+            self.masks.compose(
+                self.sharpened(
+                    part.alpha,
+                    part.what,
+                    part.place,
+                    None if evidence is None else which.of_frames(evidence),
+                    context.schedule,
+                ),
+                part.presence,
+                part.valid,
+                paster,
+            )
+            for which, part, paster in zip(parts, seen, pasters, strict=True)
         ]
 
         q_background = self.background.posterior(in_order(parts, [m.background for m in masks]), images)
@@ -536,7 +584,7 @@ class Apex(SceneModel):
                 masks.objects,
                 means,
                 masks.background,
-                self.background.cast(backdrop, image, context.schedule.get("shadow")),
+                self.background.cast(backdrop, image, context.schedule.get("refinement")),
             ),
             log_likelihood,
             mask_entropy(masks),
