@@ -175,6 +175,10 @@ class ApexNormalisation(MaskNormalisation):
         """alpha = c tanh(CNN(z_what)) (Eq. 7)."""
         return self.c * tanh(raw)
 
+    def raw(self, alpha: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
+        """The inverse of `logits`, within +-7.25."""
+        return torch.atanh((alpha / self.c).clamp(-NEARLY, NEARLY))
+
     def _occupancy(
         self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster
     ) -> Float[Tensor, "... H W"]:

@@ -201,7 +201,7 @@ def _gain(
     pairs: Pairs,
     q_what: Gaussian,
 ) -> Float[Tensor, " V"]:
-    """By how much the bound rises for each pair, with the price of a piece, in nats; z_where, a few nats, is left out."""
+    """By how much the bound rises for each pair, with the price of a piece; nats. z_where, a few nats, is left out."""
     frame, first, second = pairs.frame, pairs.first, pairs.second
     backdrop = model.background.decode(model.background.posterior(alone.background, images).mean)
     means = _means(model, known.what, known.place)

@@ -1,8 +1,8 @@
 """What masks may see of the image itself. Not in the paper, whose masks are decoded from z_what alone (Eq. 7).
 
 A code of some numbers cannot hold where each rim runs, so decoded masks are blobs. The likelihood knows better: it
-gives a pixel that the background draws well to the background. Here features of each pixel shift the mask logits by how well
-they agree with what the object's code asks for; the rest of the mask normalisation stays as it is.
+gives a pixel that the background draws well to the background. Here features of each pixel shift the mask logits by how
+well they agree with what the object's code asks for; the rest of the mask normalisation stays as it is.
 """
 
 from __future__ import annotations
