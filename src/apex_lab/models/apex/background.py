@@ -24,10 +24,10 @@ BRIGHTEST = math.log(2)
 def shadowed(
     backdrop: Float[Tensor, "*batch 3 H W"], image: Float[Tensor, "*batch 3 H W"], darkest: float
 ) -> Float[Tensor, "*batch 3 H W"]:
-    """The background with every pixel as dark as the image has it, down to `darkest` times its colour. Not in the paper.
+    """The background with every pixel as dark as the image has it, down to `darkest` times its colour.
 
-    A cast shadow is the same colour, darker. Of all u b with u in [darkest, 1], the one nearest to x has
-    u = <x, b> / <b, b>, clamped. There the likelihood is largest, so u passes no gradient on.
+    Not in the paper. A cast shadow is the same colour, darker. Of all u b with u in [darkest, 1], the one nearest to x
+    has u = <x, b> / <b, b>, clamped. There the likelihood is largest, so u passes no gradient on.
     """
     with torch.no_grad():
         u = (image * backdrop).sum(-3, keepdim=True) / backdrop.square().sum(-3, keepdim=True).clamp_min(1e-6)
@@ -50,8 +50,8 @@ class Background(nn.Module):
             brighten the bias image, all channels of a pixel alike in their logits, which needs a `learned` one. Over a
             table that has a hue that draws cast shadows, but few of the grey parts of a moving arm, which `colour`
             draws too, so that the foreground never explains them.
-        shadow: how dark a cast shadow may make each pixel by itself, as a share of its colour; 1 is the paper's: none. A
-            pixel is as likely lit as it is shadowed (see `seen`).
+        shadow: how dark a cast shadow may make each pixel by itself, as a share of its colour; 1 is the paper's: none.
+            A pixel is as likely lit as it is shadowed (see `seen`).
 
     Raises:
         ValueError: there is no bias image to shade.
