@@ -257,6 +257,12 @@ APEX = ("model=apex", "data=p2d", "scale=smoke")
         ("model.encoder.depths=[100,100,100,100]", "model.encoder: it has more than 20,000 parts"),
         ("model.background.image_size=64", "model.background.image_size=64 must be that of the model, 32."),
         ("model.image_size=48", "model.image_size=48 must be a multiple of 32, its quarter one of model.grid=4"),
+        ("model.merges=-1", "model.merges = -1 is wrong: input should be greater than or equal to 0."),
+        ("model.background.shadow=0", "model.background.shadow = 0 is wrong: input should be greater than 0."),
+        (
+            "model.background.shadow=1.5",
+            "model.background.shadow = 1.5 is wrong: input should be less than or equal to 1.",
+        ),
         ("schedule.temperature.end=0", "schedule.temperature is 0 at step"),
         ("++schedule.carry.end=2", "schedule.carry is 2 at step 0: it must be between 0 and 1."),
         ("loss.nll=-1", "loss.nll is -1 at step 0: it must be at least 0."),

@@ -23,6 +23,7 @@ from torch import Tensor
 from apex_lab.config import components
 from apex_lab.inference.predictor import joined
 from apex_lab.models.apex.likelihood import MixtureLikelihood, log_normal
+from apex_lab.models.apex.loop import carries_on, may_discover, rendered
 from apex_lab.models.apex.masks import ApexNormalisation, Masks
 from apex_lab.models.apex.merging import merged
 from apex_lab.models.apex.model import Apex
@@ -136,7 +137,7 @@ class Straightforward(Apex):
         schedule: Schedule,
         noise: Noise | None,
     ) -> Step:
-        """Propagation, presence of discoveries, filtering: the body of the loop in `Apex._roll_out`."""
+        """Propagation, presence of discoveries, filtering: the body of the loop in `loop.roll_out`."""
         temperature = schedule["temperature"]
         before, posterior = self.propagation(
             memory.objects,
@@ -154,12 +155,12 @@ class Straightforward(Apex):
         claims = self.masks.claim(alphas, paster)
         [cells] = frames_of(look_at[:, None], follow_in[:, None], proposals, alphas[:, None])
 
-        open_ = self._may_discover(memory.carried_on, schedule, noise).to(scope.dtype)
+        open_ = may_discover(memory.carried_on, schedule, noise).to(scope.dtype)
         prob = cells.prob * context_probability(scope, claims) * open_
         prior = schedule["discovery_presence"] * scope_in_windows(scope, *paster.inside()) * open_
         pres = sample_presence(prob, temperature, noise) * open_
         top = prob.detach().topk(self.render_top, dim=1).indices
-        found = self._found(cells, pres, top)
+        found = rendered(cells, pres, top, self.hidden)
         candidates = Objects(*(torch.cat(pair, dim=1) for pair in zip(before, found, strict=True)))
         exists = torch.cat([memory.valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
         kept = carry(candidates.presence, exists, memory.ids, memory.next_id, self.keep_threshold)
@@ -186,7 +187,7 @@ class Straightforward(Apex):
     ) -> None:
         memory.objects = Objects(*(gather_slots(field, kept.source) for field in candidates))
         memory.ids, memory.next_id = kept.ids, kept.next_id
-        memory.carried_on = self._carried_on(memory.carried_on, schedule, noise)
+        memory.carried_on = carries_on(memory.carried_on, schedule, noise)
         memory.valid = kept.valid & memory.carried_on
 
     def _render(

@@ -30,6 +30,7 @@ MOVING = tuple(
 )
 """Schedules that change at every step."""
 MUON = ("optimizer._target_=apex_lab.training.optimizers.Muon",)
+MERGES = ("model.background.shadow=0.7", "model.merges=1", "model.start_presence=0.9", "model.start_size=0.4")
 SCALED = ("lr_scale={_target_: apex_lab.training.schedules.Linear, start: 1.0, end: 0.5, steps: 20}",)
 
 
@@ -67,8 +68,8 @@ def rows(made: Workload, steps: int) -> list[dict[str, float]]:
 
 @pytest.mark.parametrize(
     ("words", "tolerance"),
-    [((), 1e-4), (MUON, 1e-4), (("trainer.precision=bf16-mixed",), 2e-3)],
-    ids=["Adam", "Muon", "bf16"],
+    [((), 1e-4), (MUON, 1e-4), (MERGES, 1e-4), (("trainer.precision=bf16-mixed",), 2e-3)],
+    ids=["Adam", "Muon", "merges and shadows", "bf16"],
 )
 @pytest.mark.usefixtures("replayed", "as_on_a_gpu")
 def test_a_replayed_step_of_apex_trains_as_an_eager_one(words: tuple[str, ...], tolerance: float) -> None:
@@ -133,10 +134,12 @@ def always_the_same(made: Workload) -> int:
     [
         MUON,
         ("trainer.precision=bf16-mixed",),
+        (*MERGES, "trainer.precision=bf16-mixed"),
+        MERGES,
         pytest.param(("+ablation=image_stn",), marks=pytest.mark.slow),
         pytest.param(("+ablation=gaussian_scalor_norm",), marks=pytest.mark.slow),
     ],
-    ids=["Muon", "bf16", "image_stn", "gaussian_scalor_norm"],
+    ids=["Muon", "bf16", "merges and shadows in bf16", "merges and shadows", "image_stn", "gaussian_scalor_norm"],
 )
 @pytest.mark.usefixtures("as_on_a_gpu")
 def test_the_step_is_the_same_whatever_it_sees(words: tuple[str, ...]) -> None:
@@ -151,9 +154,10 @@ def test_the_step_of_other_models_too(model: str) -> None:
     assert always_the_same(Workload(config, torch.device("cpu"), 2, 3, mode="cuda graph")) > 500
 
 
+@pytest.mark.parametrize("words", [(), MERGES], ids=["paper", "merges and shadows"])
 @pytest.mark.usefixtures("as_on_a_gpu")
-def test_inference_is_the_same_whatever_it_sees() -> None:
-    made = workload()
+def test_inference_is_the_same_whatever_it_sees(words: tuple[str, ...]) -> None:
+    made = workload(*words)
 
     def infer(video: Tensor) -> list[Any]:
         return traced(lambda: made.predictor({"video": video, "name": ["a video"]}))
@@ -180,7 +184,7 @@ class OnOneDevice(TorchDispatchMode):
         return results
 
 
-@pytest.mark.parametrize("words", [(), MUON], ids=["Adam", "Muon"])
+@pytest.mark.parametrize("words", [(), MUON, MERGES], ids=["Adam", "Muon", "merges and shadows"])
 @pytest.mark.usefixtures("as_on_a_gpu")
 def test_nothing_of_the_step_lies_on_the_host(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """The device `meta` has shapes without numbers: whatever asks for a number raises."""

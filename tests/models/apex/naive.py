@@ -70,13 +70,20 @@ def frame_masks(
 
 
 def log_likelihood(
-    image: Tensor, masks: list[Tensor], means: list[Tensor], likelihood: MixtureLikelihood, scales: tuple[float, float]
+    image: Tensor,
+    masks: list[Tensor],
+    means: list[Tensor],
+    backdrops: list[Tensor],
+    likelihood: MixtureLikelihood,
+    scales: tuple[float, float],
 ) -> float:
-    """Eq. 1, pixel by pixel and channel by channel; the last mask and mean are the background's.
+    """Eq. 1, pixel by pixel and channel by channel; the last mask is the background's, whose images are alike likely.
 
     scales: what sigma_fg and sigma_bg are multiplied by.
     """
-    sigmas = [likelihood.sigma_fg * scales[0]] * (len(masks) - 1) + [likelihood.sigma_bg * scales[1]]
+    sigmas = [likelihood.sigma_fg * scales[0]] * len(means) + [likelihood.sigma_bg * scales[1]] * len(backdrops)
+    masks = [*masks[:-1], *[masks[-1] / len(backdrops)] * len(backdrops)]
+    means = [*means, *backdrops]
     flat_masks = [m.flatten().tolist() for m in masks]
     total = 0.0
     for channel in range(3):
@@ -169,6 +176,28 @@ def propagate(model: Apex, e: Tensor, thing: Thing, told: Told) -> Thing:
     return moved
 
 
+def decoded(model: Apex, z: Tensor) -> Tensor:
+    """z_bg -> (3, H, W)."""
+    logit = model.background.decoder(z[None])[0]
+    if model.background.change == "shade":
+        logit = torch.log(2 / (1 + torch.exp(-logit)))
+    return torch.sigmoid(logit + model.background.bias_image)
+
+
+def looks(model: Apex, backdrop: Tensor, image: Tensor) -> list[Tensor]:
+    """What each pixel of the background may look like: as decoded, and with the image's cast shadow on it."""
+    darkest = model.background.shadow
+    if darkest == 1:
+        return [backdrop]
+    dark = backdrop.clone()
+    for y in range(dark.shape[1]):
+        for x in range(dark.shape[2]):
+            b, seen = backdrop[:, y, x].tolist(), image[:, y, x].tolist()
+            u = sum(p * q for p, q in zip(b, seen, strict=True)) / sum(p * p for p in b)
+            dark[:, y, x] *= min(max(u, darkest), 1.0)
+    return [backdrop, dark]
+
+
 def discover(model: Apex, e: Tensor, scope: Tensor, p0: float, told: Told) -> list[Thing]:
     """Eq. 16-18 and Eq. 6 of all cells; the rendered ones that are present, the most probable first."""
     net, glimpses, g, size = model.discovery, model.glimpses, model.discovery.grid, model.image_size
@@ -244,13 +273,10 @@ def explain(model: Apex, video: Tensor, p0: float, scales: tuple[float, float]) 
         prior = (torch.zeros_like(z), torch.ones_like(z))
         if z_before is not None:
             prior = normal(model.background.transition(z_before))
-        logit = model.background.decoder(z[None])[0]
-        if model.background.change == "shade":
-            logit = torch.log(2 / (1 + torch.exp(-logit)))
-        backdrop = torch.sigmoid(logit + model.background.bias_image)
+        backdrops = looks(model, decoded(model, z), image)
         z_before = z
 
-        told.terms["nll"] -= log_likelihood(image, [*masks, m_bg], [*means, backdrop], model.likelihood, scales)
+        told.terms["nll"] -= log_likelihood(image, [*masks, m_bg], means, backdrops, model.likelihood, scales)
         told.terms["mask_entropy"] += entropy(masks, m_fg)
         told.terms["kl_background"] += kl_normal(q_background, prior)
 
@@ -262,7 +288,7 @@ def explain(model: Apex, video: Tensor, p0: float, scales: tuple[float, float]) 
         shown = {thing.identity: mask for thing, mask in zip(things, masks, strict=True) if thing.identity > 0}
         told.slots.append([thing.identity if thing is not None else -1 for thing in slots])
         told.masks.append(shown)
-        picture = sum((m * mean for m, mean in zip(masks, means, strict=True)), m_bg * backdrop)
+        picture = sum((m * mean for m, mean in zip(masks, means, strict=True)), m_bg * backdrops[-1])
         assert isinstance(picture, Tensor)
         told.pictures.append(picture)
     return told

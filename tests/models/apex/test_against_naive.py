@@ -50,8 +50,9 @@ def test_masks_identities_and_every_term_of_the_objective(slots: int, render_top
         assert max(one.contexts) > 0.9
 
 
-def test_with_a_background_that_is_a_shade() -> None:
+@pytest.mark.parametrize("shadow", [1.0, 0.7])
+def test_with_a_background_that_is_a_shade(shadow: float) -> None:
     torch.manual_seed(7)
-    background = Background(SIZE, 6, 6, change="shade")
+    background = Background(SIZE, 6, 6, change="shade", shadow=shadow)
     background.initialise(0.2 + 0.6 * torch.rand(3, SIZE, SIZE))
     check(lively(background=background).double().eval(), video(2, 4).double())

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-import apex_lab.models.apex.model as module
+import apex_lab.models.apex.loop as module
 from apex_lab.models.apex.objects import Proposals
 from apex_lab.models.apex.slots import Carried, carry
 from apex_lab.nn.distributions import Gaussian

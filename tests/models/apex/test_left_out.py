@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from apex_lab.models.apex import Background
 from apex_lab.nn.noise import RankNoise
 from apex_lab.scene import Context, Scene, schedule_at
 from tests.models.apex.small import SCHEDULE, everything, lively, video
@@ -16,9 +17,11 @@ IMAGES = {"carry": 0.0, "discover": 1.0}  # no object is ever carried on
 LEFT_ALONE = {"carry": 1.0, "discover": 0.0}  # carried videos never discover
 
 
-def passed(changed: dict[str, float], all_of_it: bool, chunks: int = 1) -> tuple[list[Scene], dict[str, Tensor | None]]:
+def passed(
+    changed: dict[str, float], all_of_it: bool, chunks: int = 1, **parts: object
+) -> tuple[list[Scene], dict[str, Tensor | None]]:
     """Scenes of a pass in training, and the gradients of the sum of all terms, the one noise after the other."""
-    model = lively().double().train()
+    model = lively(**parts).double().train()
     schedule = {**SCHEDULE, **schedule_at(changed)}
     torch.manual_seed(3)
     scenes: list[Scene] = []
@@ -30,12 +33,21 @@ def passed(changed: dict[str, float], all_of_it: bool, chunks: int = 1) -> tuple
     return scenes, {name: weight.grad for name, weight in model.named_parameters()}
 
 
+SOME = {"carry": 0.6, "discover": 0.3}
+MERGES = {"merges": 2, "background": Background(32, 6, 6, shadow=0.7)}
+
+
 @pytest.mark.parametrize("chunks", [1, 3])
 @pytest.mark.parametrize(
-    "changed", [{}, IMAGES, LEFT_ALONE, {"carry": 0.6, "discover": 0.3}], ids=["videos", "images", "alone", "some"]
+    ("changed", "parts"),
+    [({}, {}), (IMAGES, {}), (LEFT_ALONE, {}), (SOME, {}), (SOME, MERGES)],
+    ids=["videos", "images", "alone", "some", "merges and shadows"],
 )
-def test_what_holds_nothing_changes_no_number_and_no_gradient(changed: dict[str, float], chunks: int) -> None:
-    (scenes, gradients), (expected, wanted) = (passed(changed, all_of_it, chunks) for all_of_it in (False, True))
+def test_what_holds_nothing_changes_no_number_and_no_gradient(
+    changed: dict[str, float], parts: dict[str, object], chunks: int
+) -> None:
+    passes = [passed(changed, all_of_it, chunks, **parts) for all_of_it in (False, True)]
+    (scenes, gradients), (expected, wanted) = passes
     for scene, other in zip(scenes, expected, strict=True):
         for name in ("masks", "presence", "appearance", "reconstruction"):
             torch.testing.assert_close(getattr(scene, name), getattr(other, name), rtol=1e-10, atol=1e-10)

@@ -1,5 +1,7 @@
 """The whole model on tiny videos: shapes, independence, identities, gradients, reproducibility, tracking."""
 
+import math
+
 import pytest
 import torch
 
@@ -12,6 +14,7 @@ from apex_lab.models.apex import (
     MixtureLikelihood,
     ScalorNormalisation,
 )
+from apex_lab.models.apex.background import shadowed
 from apex_lab.models.apex.objects import Objects
 from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian
@@ -192,6 +195,8 @@ def test_z_what_zero_gives_discovery_and_propagation_the_same_appearance() -> No
         {"render_top": None},
         {"background": Background(32, 6, 6, "none")},
         {"kl": "exclusive"},
+        {"merges": 2, "background": Background(32, 6, 6, shadow=0.7)},
+        {"merges": 1, "likelihood": GaussianLikelihood(), "masks": ScalorNormalisation(), "start_size": 0.5},
     ],
 )
 def test_every_variant_trains_a_step(part: dict) -> None:
@@ -245,6 +250,39 @@ def test_the_posterior_is_bayes_rule_on_what_the_scene_shows() -> None:
     torch.testing.assert_close(found.double(), (joint / joint.sum(2, keepdim=True)).mean(3), atol=1e-5, rtol=1e-4)
     assert (found[scene.masks == 0] == 0).all()
     assert not torch.allclose(found, scene.masks, atol=0.01)
+
+
+def test_the_posterior_knows_cast_shadows() -> None:
+    model = tiny(background=Background(32, 6, 6, shadow=0.6)).eval()
+    scene = model(video(), CONTEXT)
+    found = model.posterior(scene, video(), CONTEXT)
+    torch.testing.assert_close(found.sum(2), torch.ones(3, 4, 32, 32))
+    assert scene.means is not None
+    dark = scene.means.clone()
+    dark[:, :, -1] = shadowed(dark[:, :, -1], video(), 0.6)
+    sigma = torch.where(scene.background, 0.04, 0.1)[:, None, None, None]
+    seen = video()[:, :, None]
+    looks = [torch.distributions.Normal(x, sigma).log_prob(seen).double().exp() for x in (scene.means, dark)]
+    joint = scene.masks[:, :, :, None].double() * (looks[0] + looks[1]) / 2
+    torch.testing.assert_close(found.double(), (joint / joint.sum(2, keepdim=True)).mean(3), atol=1e-5, rtol=1e-4)
+    plain = model.likelihood.responsibilities(  # type: ignore[attr-defined]
+        video().flatten(0, 1), scene.masks.flatten(0, 1), scene.means.flatten(0, 1), scene.background
+    )
+    assert not torch.allclose(found.flatten(0, 1), plain, atol=0.01)
+
+
+def test_without_objects_cast_shadows_are_all_that_is_added_to_the_background() -> None:
+    model = tiny(start_presence=0.01, background=Background(32, 6, 6, shadow=0.6)).eval()
+    scene = model(video(), CONTEXT)
+    assert (scene.presence[:, :, :-1] == 0).all()
+    assert scene.means is not None
+    lit = scene.means[:, :, -1]
+    dark = shadowed(lit, video(), 0.6)
+    torch.testing.assert_close(scene.reconstruction, dark)
+    assert not torch.equal(dark, lit)
+    looks = [torch.distributions.Normal(x, 0.04).log_prob(video()) for x in (lit, dark)]
+    want = -(torch.logaddexp(*looks) - math.log(2)).sum((1, 2, 3, 4))
+    torch.testing.assert_close(scene.terms["nll"], want)
 
 
 def test_a_posterior_is_refused_without_detail_and_under_one_gaussian() -> None:

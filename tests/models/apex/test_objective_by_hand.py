@@ -127,7 +127,7 @@ def test_likelihood_and_mask_entropy() -> None:
                 colours = [torch.sigmoid(model.colour_decoder(steps.what[b, t, k][None])[0]) for k in there]
                 backdrop = model.background.decode(seen.z_background[b, t][None])[0]
             means = [naive.paste(colour, w, SIZE) for colour, w in zip(colours, windows, strict=True)]
-            nll -= naive.log_likelihood(image[b, t], [*masks, m_bg], [*means, backdrop], model.likelihood, (1.25, 0.75))
+            nll -= naive.log_likelihood(image[b, t], [*masks, m_bg], means, [backdrop], model.likelihood, (1.25, 0.75))
             entropy += naive.entropy(masks, m_fg)
         assert float(seen.scene.terms["nll"][b]) == pytest.approx(nll, rel=1e-9)
         assert float(seen.scene.terms["mask_entropy"][b]) == pytest.approx(entropy, rel=1e-9)

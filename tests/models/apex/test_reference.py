@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
 import pytest
 import torch
 
 from apex_lab.config.building import build_model, build_schedules
 from apex_lab.models.apex import Apex
 from apex_lab.nn.spatial_transformer import Paster, crop
-from apex_lab.scene import Context, schedule_at
+from apex_lab.scene import Context, Noise, Scene, schedule_at
 from tests.conftest import compose_job
+from tests.models.apex.small import propose, spread
 from tests.reference.apex import Straightforward, twins
 from tests.reference.grid import GridPaster, grid_crop
 
 ALL, AS_MANY = "straightforward", "straightforward, renders as many"
+MERGES = ("model.background.shadow=0.7", "model.merges=1", "model.start_size=0.4")
 
 
 def pair(*words: str, twin: str = ALL) -> tuple[Apex, Straightforward, Context]:
@@ -45,7 +50,69 @@ VIDEO = torch.rand(3, 4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
 )
 def test_the_twin_gives_the_same_terms_masks_and_gradients(twin: str, words: tuple[str, ...]) -> None:
     model, other, context = pair(*words, twin=twin)
-    scenes = [each.eval()(VIDEO, context) for each in (model, other)]
+    compared(model, other, [each.eval()(VIDEO, context) for each in (model, other)])
+
+
+@pytest.mark.parametrize("training", [False, True], ids=["evaluation", "training"])
+def test_the_twin_merges_and_casts_shadows_too(training: bool) -> None:
+    torch.manual_seed(0)
+    model, other, context = pair(*MERGES, twin=AS_MANY)
+    spread(model.discovery.head_pres[-1], 0.0, 4.0, lambda: propose(model))
+    other.load_state_dict(model.state_dict())
+    for each in (model, other):
+        each.double().train(training)
+    video, drawn = VIDEO.double(), Kept()
+    torch.manual_seed(2)
+    fast = model(video, replace(context, noise=drawn))
+    plain = other(video, replace(context, noise=Given(by_frame(drawn.numbers, *video.shape[:2]))))
+    compared(model, other, [fast, plain])
+    model.merges = 0
+    torch.manual_seed(2)
+    assert not torch.equal(model(video, replace(context, noise=Kept())).masks, fast.masks)
+
+
+class Kept(Noise):
+    """Keeps the numbers that it draws."""
+
+    def __init__(self) -> None:
+        self.numbers: list[torch.Tensor] = []
+
+    def normal(self, like: torch.Tensor) -> torch.Tensor:
+        self.numbers.append(super().normal(like))
+        return self.numbers[-1]
+
+    def uniform(self, like: torch.Tensor) -> torch.Tensor:
+        self.numbers.append(super().uniform(like))
+        return self.numbers[-1]
+
+
+class Given(Noise):
+    """Gives numbers out, one draw after the other."""
+
+    def __init__(self, numbers: Iterable[torch.Tensor]) -> None:
+        self.numbers = iter(numbers)
+
+    def normal(self, like: torch.Tensor) -> torch.Tensor:
+        return next(self.numbers).view_as(like)
+
+    def uniform(self, like: torch.Tensor) -> torch.Tensor:
+        return next(self.numbers).view_as(like)
+
+
+def by_frame(numbers: list[torch.Tensor], b: int, t: int) -> Iterator[torch.Tensor]:
+    """The model's draws (discovery of all frames, six of each frame's loop, background of all) in the twin's order."""
+    if not numbers:  # in evaluation nothing is drawn
+        return
+    where, what, *loop, background = (x.unflatten(0, (b, t, -1)) if i < 2 else x for i, x in enumerate(numbers))
+    for i in range(t):
+        yield where[:, i].flatten(0, 1)
+        yield what[:, i].flatten(0, 1)
+        yield from loop[6 * i : 6 * i + 6]
+        yield background.unflatten(0, (b, t))[:, i]
+
+
+def compared(model: Apex, other: Straightforward, scenes: list[Scene]) -> None:
+    """Checks that model and twin say the same of a video, with the same gradients."""
     fast, plain = scenes
     assert (fast.ids[:, :, :-1] > 0).any()
     assert torch.equal(fast.ids, plain.ids)

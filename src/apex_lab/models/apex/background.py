@@ -26,9 +26,8 @@ def shadowed(
 ) -> Float[Tensor, "*batch 3 H W"]:
     """The background with every pixel as dark as the image has it, down to `darkest` times its colour.
 
-    Not in the paper.
-    A cast shadow is the same colour, darker. Of all u b with u in [darkest, 1], the one nearest to x has
-    u = <x, b> / <b, b>, clamped. There the likelihood is largest, so u passes no gradient on.
+    Not in the paper. A cast shadow is the same colour, darker. Of all u b with u in [darkest, 1], the one nearest to x
+    has u = <x, b> / <b, b>, clamped. There the likelihood is largest, so u passes no gradient on.
     """
     with torch.no_grad():
         u = (image * backdrop).sum(-3, keepdim=True) / backdrop.square().sum(-3, keepdim=True).clamp_min(1e-6)

@@ -1,6 +1,6 @@
 """What chance decides about a pass before any network has run, so that a CPU leaves out what nobody will see.
 
-Which videos carry their objects on and which may discover (`Apex._carried_on`, `Apex._may_discover`) are draws alone.
+Which videos carry their objects on and which may discover (`loop.carries_on`, `loop.may_discover`) are draws alone.
 So all of a pass's numbers are drawn at its start, in the order and layout in which the networks ask for them.
 """
 

@@ -16,45 +16,21 @@ from apex_lab.models.apex.encoder import ApexEncoder
 from apex_lab.models.apex.foresight import NoiseOfFrames, Plan, planned
 from apex_lab.models.apex.glimpses import Glimpses
 from apex_lab.models.apex.likelihood import Likelihood, MixtureLikelihood
+from apex_lab.models.apex.loop import claims_of, roll_out
 from apex_lab.models.apex.masks import MaskNormalisation, Masks, blended
 from apex_lab.models.apex.merging import merged
 from apex_lab.models.apex.objective import Direction, DiscoveryPrior, kl_terms, loose_windows, mask_entropy
-from apex_lab.models.apex.objects import (
-    Appearance,
-    Beliefs,
-    Discovery,
-    Objects,
-    Posterior,
-    Propagation,
-    Proposals,
-    at_frames,
-    context_probability,
-    sample_presence,
-    scope_in_windows,
-    spread,
-)
+from apex_lab.models.apex.objects import Appearance, Beliefs, Discovery, Propagation, Proposals, at_frames
 from apex_lab.models.apex.parts import Part, in_order, parts_of
 from apex_lab.models.apex.pixels import PixelEvidence
 from apex_lab.models.apex.result import Drawn, Picture, scene_of, video_of
-from apex_lab.models.apex.rollout import (
-    Claimed,
-    Claims,
-    FollowedMasks,
-    Frame,
-    Memory,
-    State,
-    Step,
-    frames_of,
-    stack_steps,
-)
-from apex_lab.models.apex.slots import carry
+from apex_lab.models.apex.rollout import Memory, State, Step, frames_of
 from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
 from apex_lab.nn.distributions import kl_gaussian
 from apex_lab.nn.shared import gathered_gradients
-from apex_lab.nn.slots import NoiseOfSlots, any_of, filled, gather_slots, inverse_of, may_look
+from apex_lab.nn.slots import may_look
 from apex_lab.nn.spatial_transformer import Paster
-from apex_lab.nn.splitting import joined, part_size
 from apex_lab.scene import Context, Noise, Scene, SceneModel, Schedule, Statistics
 
 Count = Annotated[int, Field(gt=0)]
@@ -179,14 +155,14 @@ class Apex(SceneModel):
         Args:
             video: RGB in [0, 1].
             context: its schedule holds `temperature` of the relaxed Bernoulli; `discovery_presence` p0; `carry`, the
-                probability in
-                [0, 1] with which a video's objects are carried into the next frame in training (see `_carried_on`);
-                `discover`, the probability in [0, 1] with which a carried video may discover too (see `_may_discover`);
-                `sigma_fg_scale` and `sigma_bg_scale`, what the likelihood's sigmas are multiplied by. A wide sigma_bg:
-                the background first learns what it can, such as cast shadows, before objects are asked to explain the
-                rest. A wide sigma_fg: while objects cannot be drawn well yet, two components of half an object gain
-                less likelihood over one of the whole than the second one costs. `refinement` (may be missing:
-                1), how much of what is not the paper's counts: cast shadows, pixels in masks, the price of a piece.
+                probability in [0, 1] with which a video's objects are carried into the next frame in training (see
+                `loop.carries_on`); `discover`, the probability in [0, 1] with which a carried video may discover too
+                (see `loop.may_discover`); `sigma_fg_scale` and `sigma_bg_scale`, what the likelihood's sigmas are
+                multiplied by. A wide sigma_bg: the background first learns what it can, such as cast shadows, before
+                objects are asked to explain the rest. A wide sigma_fg: while objects cannot be drawn well yet, two
+                components of half an object gain less likelihood over one of the whole than the second one costs.
+                `refinement` (may be missing: 1), how much of what is not the paper's counts: cast shadows, pixels in
+                masks, the price of a piece.
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
@@ -208,12 +184,12 @@ class Apex(SceneModel):
             alphas = self.alpha(found.what)
         with record_function("loop over time"):
             shape = (video.shape[0], video.shape[1])
-            claims = self._claims(alphas, found.place, plan, shape)
+            claims = claims_of(self, alphas, found.place, plan, shape)
             proposals = found.over_time(shape, plan.opened)
             frames = frames_of(look_at, follow_in, proposals, at_frames(alphas, shape, plan.opened))
             shared = (self.propagation, self.appearance, self.glimpses, self.mask_decoder)
             with gathered_gradients(*shared, like=features):
-                steps, memory = self._roll_out(frames, claims, memory, context.schedule, plan.noise)
+                steps, memory = roll_out(self, frames, claims, memory, context.schedule, plan.noise)
         with record_function("rendering"):
             return self._explain(
                 video, evidence, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z)
@@ -325,173 +301,6 @@ class Apex(SceneModel):
         for _ in range(self.merges):
             found = merged(self, found, images, evidence, maps[1], schedule)
         return found
-
-    def _roll_out(
-        self, frames: list[Frame], claims: list[Claims | None], memory: Memory, schedule: Schedule, noise: Noise | None
-    ) -> tuple[Step, Memory]:
-        """The part that depends on the frame before, frame by frame (Eq. 2, which is Eq. 13).
-
-        Within a frame (Eq. 14): propagated objects, then discovered ones; the background, whose posterior needs the
-        masks of both, is left to `_explain`.
-        """
-        state, valid, ids, next_id, carried_on = memory
-        followed = False
-        steps: list[Step] = []
-        followed_masks: list[FollowedMasks | None] = []
-        for t, (frame, claimed) in enumerate(zip(frames, claims, strict=True)):
-            there = any_of(valid)
-            if there or (t == len(frames) - 1 and not followed):  # once at least, so that all weights have gradients
-                followed = True
-                with record_function("propagation"):
-                    slots = filled(valid)
-                    few, posterior = self._propagated(state, valid, slots, frame, schedule, noise)
-                    before = few
-                    if slots is not None:
-                        before, posterior = spread(few, posterior, slots, valid)
-                    few_alpha = None if claimed is None else self.alpha(few.what)
-                    followed_masks.append(FollowedMasks(few.what, few_alpha, slots))
-            else:
-                before, posterior = self.propagation.nothing(state, noise)
-                followed_masks.append(None)
-
-            open_ = self._may_discover(carried_on, schedule, noise).to(frame.prob.dtype)
-            context = unexplained = torch.ones_like(frame.prob)  # where nothing is propagated, everything is open
-            if there and claimed is not None:
-                assert few_alpha is not None
-                with record_function("discovery"):
-                    paster = self.paster(few.place, few_alpha.shape[-1])
-                    scope = claimed.of_videos(1 - self.masks.foreground(few_alpha, few.presence, paster))
-                    context = claimed.put(context, context_probability(scope, claimed.masks))
-                    unexplained = claimed.put(unexplained, scope_in_windows(scope, claimed.rows, claimed.columns))
-            prob = frame.prob * context * open_  # Eq. 17
-            # Eq. 6: the prior of a discovery's presence, given the propagated objects
-            prior = schedule["discovery_presence"] * unexplained * open_
-            pres = sample_presence(prob, schedule["temperature"], noise) * open_
-            top = prob.detach().topk(self.render_top, dim=1).indices
-            found = self._found(frame, pres, top)
-
-            both = torch.cat([before.packed(), found.packed()], dim=1)
-            candidates = before.unpacked(both)
-            exists = torch.cat([valid, torch.ones_like(top, dtype=torch.bool)], dim=1)
-            kept = carry(candidates.presence, exists, ids, next_id, self.keep_threshold)
-            steps.append(
-                Step(
-                    candidates.what,
-                    candidates.place,
-                    gather_slots(frame.alpha, top),
-                    candidates.presence,
-                    exists & (candidates.presence > 0),
-                    valid,
-                    posterior,
-                    prob,
-                    prior,
-                    pres,
-                    kept.source,
-                    kept.valid,
-                    kept.ids,
-                )
-            )
-            state, ids, next_id = before.unpacked(gather_slots(both, kept.source)), kept.ids, kept.next_id
-            carried_on = self._carried_on(carried_on, schedule, noise)
-            valid = kept.valid & carried_on
-        video = stack_steps(steps)
-        assert isinstance(video.propagated, Posterior)
-        beliefs = self.propagation.beliefs(video.propagated)
-        alpha = torch.cat([self._followed(followed_masks, video.alpha, valid.shape[1]), video.alpha], dim=2)
-        return video._replace(propagated=beliefs, alpha=alpha), Memory(state, valid, ids, next_id, carried_on)
-
-    def _propagated(
-        self,
-        state: Objects,
-        valid: Tensor,
-        slots: Tensor | None,
-        frame: Frame,
-        schedule: Schedule,
-        noise: Noise | None,
-    ) -> tuple[Objects, Posterior]:
-        """The objects in some slots (B, n), None for all, in the next frame."""
-        total = valid.shape[1]
-        if slots is not None:
-            state, valid = state.unpacked(gather_slots(state.packed(), slots)), valid.gather(1, slots)
-            noise = None if noise is None else NoiseOfSlots(noise, slots, total)
-        return self.propagation(
-            state,
-            self.glimpses,
-            self.appearance,
-            frame.look_at,
-            frame.follow_in,
-            valid,
-            schedule["temperature"],
-            noise,
-        )
-
-    def _followed(
-        self, frames: list[FollowedMasks | None], like: Float[Tensor, "B T N g g"], total: int
-    ) -> Float[Tensor, "B T P g g"]:
-        """Mask logits of all slots in all frames; those that the loop could do without are made here, at once."""
-        waiting = [frame.what for frame in frames if frame is not None and frame.alpha is None]
-        counts = [what.shape[1] for what in waiting]
-        made = iter(self.alpha(torch.cat(waiting, dim=1)).split(counts, dim=1) if waiting else ())
-        found = []
-        for frame in frames:
-            if frame is None:
-                found.append(like.new_zeros(len(like), total, *like.shape[3:]))
-                continue
-            alpha = next(made) if frame.alpha is None else frame.alpha
-            found.append(alpha if frame.slots is None else gather_slots(alpha, inverse_of(frame.slots, total)))
-        return torch.stack(found, dim=1)
-
-    def _claims(
-        self, alphas: Float[Tensor, "F D g g"], place: Float[Tensor, "F D 4"], plan: Plan, shape: tuple[int, int]
-    ) -> list[Claims | None]:
-        """What the cells of each frame would cover on their own, where that matters: no frame waits for another."""
-        which = None if plan.hidden is None else Claimed.of(plan.hidden, plan.opened)
-        if which is not None:
-            alphas, place = (x.index_select(0, which.rows) for x in (alphas, place))
-        size = part_size(max(1, len(alphas)), alphas.shape[1] * self.image_size**2, place)
-        found = []
-        for alpha, where in zip(*(x.split(size) for x in (alphas, place)), strict=True):
-            paster = self.paster(where, alpha.shape[-1])
-            found.append((self.masks.claim(alpha, paster), *paster.inside()))
-        claims = [joined(parts) for parts in zip(*found, strict=True)]
-        if which is None:
-            return [Claims(*values) for values in zip(*(x.unflatten(0, shape).unbind(1) for x in claims), strict=True)]
-        return which.frames(claims)
-
-    def _carried_on(self, before: Tensor, schedule: Schedule, noise: Noise | None) -> Tensor:
-        """Which videos carry their objects into the next frame, (B, 1); all in evaluation.
-
-        A curriculum over sequence length without another shape: with probability 1 - carry a video starts afresh, so
-        at 0 all frames are images that discovery explains alone, at 1 videos are whole. Propagation learns from
-        objects that exist; carried false ones of the first steps only teach it that objects should vanish.
-        """
-        if noise is None:
-            return torch.ones_like(before)
-        return noise.uniform(before.float()) < schedule["carry"]
-
-    def _may_discover(self, carried_on: Tensor, schedule: Schedule, noise: Noise | None) -> Tensor:
-        """Which videos may discover objects in this frame, (B, 1); all in evaluation.
-
-        Rediscovering everything in every frame explains a video as well as tracking does, for the price of a few KL
-        terms, and in early trials the presence of propagated objects died and did not revive. So in training a video
-        that carries objects is now and then left to them alone (a conjecture; not yet ablated by itself).
-        """
-        if noise is None:
-            return torch.ones_like(carried_on)
-        return ~carried_on | (noise.uniform(carried_on.float()) < schedule["discover"])
-
-    def _found(self, cells: Frame, pres: Tensor, top: Tensor) -> Objects:
-        """The rendered discoveries of a frame as objects; their other recurrent states start at zero."""
-        nothing = pres.new_zeros(*top.shape, self.hidden)
-        return Objects(
-            gather_slots(cells.what, top),
-            gather_slots(cells.place, top),
-            gather_slots(pres, top),
-            nothing,
-            gather_slots(cells.hidden_what, top),
-            nothing,
-            nothing,
-        )
 
     def _explain(
         self,

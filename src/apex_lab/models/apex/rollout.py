@@ -1,4 +1,4 @@
-"""The loop over time: propagation, presence of discoveries, filtering, identities (apex.md, "Inference side")."""
+"""What the loop over time (loop.py) reads, remembers and leaves."""
 
 from __future__ import annotations
 
