@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Annotated, Any, Literal
 
 import torch
@@ -120,6 +121,7 @@ class Likelihood(ABC):
         background: Float[Tensor, "N S 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
+        whole: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, " N"]:
         """Log-likelihood of each image in nats.
 
@@ -130,6 +132,7 @@ class Likelihood(ABC):
             log_background: log mask of the background; finite.
             background: its means: S images, each pixel as likely like one as like the other; the paper has one.
             scale_fg, scale_bg: factors of sigma_fg and sigma_bg; None leaves them. No gradient goes there.
+            whole: in [0, 1], how much a mixture of whole colours counts beside one of channels; None: as it was built.
         """
 
 
@@ -159,10 +162,20 @@ class MixtureLikelihood(Likelihood):
         background: Float[Tensor, "N S 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
+        whole: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, " N"]:
         sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
         args = (image, log_objects, objects, log_background, background, sigma_fg, sigma_bg)
-        return _LogMixture.apply(*args, self.mixture_over == "pixel").flatten(1).sum(1)
+        return self._mixed(whole, lambda pixel: _LogMixture.apply(*args, pixel).flatten(1).sum(1))
+
+    def _mixed(self, whole: Tensor | None, value: Callable[[bool], Tensor]) -> Tensor:
+        """A value by whole colours (true), by channels (false), or some of both; on a CPU what counts alone."""
+        if whole is None:
+            return value(self.mixture_over == "pixel")
+        if may_look(whole) and float(whole) in (0, 1):
+            return value(bool(whole))
+        by_channel, by_pixel = value(False), value(True)
+        return torch.lerp(by_channel, by_pixel, whole.to(by_channel.dtype))
 
     def responsibilities(
         self,
@@ -173,6 +186,7 @@ class MixtureLikelihood(Likelihood):
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
         shadowed: Float[Tensor, "N K 3 H W"] | None = None,
+        whole: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, "N K H W"]:
         """p(component | pixel), the posterior under Eq. 1: m_k N(x; mu_k, sigma_k^2) over its sum over components.
 
@@ -183,7 +197,7 @@ class MixtureLikelihood(Likelihood):
             masks: of all components, sum to 1 over K.
             means: their images, RGB in [0, 1].
             background: which components have the background's standard deviation.
-            scale_fg, scale_bg: as in `__call__`.
+            scale_fg, scale_bg, whole: as in `__call__`.
             shadowed: what pixels of each component are as likely like as `means`; None: `means` alone.
         """
         sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
@@ -191,10 +205,13 @@ class MixtureLikelihood(Likelihood):
         images = torch.stack([means] if shadowed is None else [means, shadowed], dim=1)
         each = log_normal(image[:, None, None], images, sigma)
         log_masks = masks.log()[:, :, None]
-        if self.mixture_over == "pixel":
-            return (log_masks + _mean_density(each.sum(3, keepdim=True))).softmax(1).squeeze(2)
-        each = _mean_density(each)
-        return (log_masks + each).softmax(1).mean(2)
+
+        def by(pixel: bool) -> Tensor:
+            if pixel:
+                return (log_masks + _mean_density(each.sum(3, keepdim=True))).softmax(1).squeeze(2)
+            return (log_masks + _mean_density(each)).softmax(1).mean(2)
+
+        return self._mixed(whole, by)
 
 
 class GaussianLikelihood(Likelihood):
@@ -217,6 +234,7 @@ class GaussianLikelihood(Likelihood):
         background: Float[Tensor, "N S 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
+        whole: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, " N"]:
         blend = (log_objects.exp()[:, :, None] * objects).sum(1) + log_background.exp()[:, None] * background[:, -1]
         sigma = _scaled(image.new_full((), self.sigma), scale_fg)

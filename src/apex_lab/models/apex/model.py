@@ -70,6 +70,7 @@ class Apex(SceneModel):
         merges: how often per frame two proposals of discovery may become one (see merging.py); the paper's is 0.
         piece_price: nats that the second of two such proposals has to be worth beyond its own cost.
         pixel_features: how many features of each pixel shift the mask logits (see pixels.py); the paper's is 0.
+        whole_colours: whether the mixture of channels becomes one of whole colours as `refinement` goes to 1.
     """
 
     term_names = ("nll", "kl_what", "kl_where", "kl_pres", "kl_background", "mask_entropy", "loose_windows")
@@ -113,6 +114,7 @@ class Apex(SceneModel):
         merges: Annotated[int, Field(ge=0)] = 0,
         piece_price: Annotated[float, Field(ge=0)] = 0.0,
         pixel_features: Annotated[int, Field(ge=0)] = 0,
+        whole_colours: bool = False,
     ) -> None:
         super().__init__()
         if image_size % 32 or (image_size // encoder.stride) % grid:
@@ -126,7 +128,7 @@ class Apex(SceneModel):
         self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
         self.input_size = (image_size, image_size)
         self.render_top = min(render_top or grid**2, grid**2)
-        self.merges, self.piece_price = merges, piece_price
+        self.merges, self.piece_price, self.whole_colours = merges, piece_price, whole_colours
         self.has_posterior = isinstance(likelihood, MixtureLikelihood)
         self.direction, self.keep_threshold = kl, keep_threshold
         self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
@@ -162,7 +164,7 @@ class Apex(SceneModel):
                 objects are asked to explain the rest. A wide sigma_fg: while objects cannot be drawn well yet, two
                 components of half an object gain less likelihood over one of the whole than the second one costs.
                 `refinement` (may be missing: 1), how much of what is not the paper's counts: cast shadows, pixels in
-                masks, the price of a piece.
+                masks, whole colours in the mixture, the price of a piece.
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
@@ -213,6 +215,7 @@ class Apex(SceneModel):
             None
             if self.background.shadow == 1
             else self._shadowed(scene, video, context.schedule).flatten(0, 1).float(),
+            self._whole(context.schedule),
         )
         return found.unflatten(0, video.shape[:2])
 
@@ -278,7 +281,15 @@ class Apex(SceneModel):
             self.background.seen(backdrop, images, schedule.get("refinement")),
             schedule["sigma_fg_scale"],
             schedule["sigma_bg_scale"],
+            self._whole(schedule),
         )
+
+    def _whole(self, schedule: Schedule) -> Float[Tensor, ""] | None:
+        """How much the mixture is one of whole colours; None: as the likelihood was built."""
+        if not self.whole_colours:
+            return None
+        refinement = schedule.get("refinement")
+        return torch.ones_like(schedule["temperature"]) if refinement is None else refinement
 
     def _plan(self, memory: Memory, features: Tensor, schedule: Schedule, noise: Noise | None) -> Plan:
         """What the pass works on: on a CPU, in training, as little as it can."""
