@@ -230,3 +230,37 @@ def test_responsibilities_far_from_every_mean_still_sum_to_one(shadowed: torch.T
     for likelihood in (MixtureLikelihood(), MixtureLikelihood(0.1, 0.04, "pixel")):
         found = likelihood.responsibilities(image + 50, masks, means, background, shadowed=shadowed)
         torch.testing.assert_close(found.sum(1), torch.ones(2, 4, 5))
+
+
+@pytest.mark.parametrize("look", [True, False])
+def test_a_mixture_may_turn_from_channels_to_whole_colours(look: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not look:  # as on a GPU, where both are computed
+        monkeypatch.setattr("apex_lab.models.apex.likelihood.may_look", lambda _: False)
+    channel, pixel = (MixtureLikelihood(0.4, 0.2, over) for over in ("channel", "pixel"))  # type: ignore[arg-type]
+    for share in (0.0, 0.25, 1.0):
+        whole = torch.tensor(share)
+        want = (1 - share) * channel(*case()) + share * pixel(*case())
+        torch.testing.assert_close(channel(*case(), whole=whole), want)
+        torch.testing.assert_close(pixel(*case(), whole=whole), want)
+        masks = [likelihood.responsibilities(*whole_case()) for likelihood in (channel, pixel)]
+        got = channel.responsibilities(*whole_case(), whole=whole)
+        torch.testing.assert_close(got, (1 - share) * masks[0] + share * masks[1])
+
+
+@pytest.mark.parametrize("over", ["channel", "pixel"])
+@pytest.mark.parametrize("images", [1, 2])
+def test_the_gradient_by_hand_equals_autograd_however_colours_are_mixed(over: str, images: int) -> None:
+    image, log_objects, means, log_background, background = case()
+    several = torch.cat([background, 0.5 * background], dim=1)[:, :images]
+    likelihood = MixtureLikelihood(0.4, 0.2, over)  # type: ignore[arg-type]
+    leaves = [x.clone().requires_grad_() for x in (image, log_objects, means, log_background, several)]
+    found = torch.autograd.grad(likelihood(*leaves).sum(), leaves)
+    x, m, mu, back, pictures = leaves
+    by_object = log_normal(x[:, None], mu, 0.4)
+    by_background = log_normal(x[:, None], pictures, 0.2)
+    if over == "pixel":
+        by_object, by_background = by_object.sum(2, keepdim=True), by_background.sum(2, keepdim=True)
+    parts = [by_object + m[:, :, None], by_background + back[:, None, None] - torch.tensor(float(images)).log()]
+    out = torch.logsumexp(torch.cat(parts, dim=1), dim=1).sum()
+    for got, want in zip(found, torch.autograd.grad(out, leaves), strict=True):
+        torch.testing.assert_close(got, want.nan_to_num())
