@@ -52,7 +52,12 @@ class PlainMixture(MixtureLikelihood):
         background: Float[Tensor, "N S 3 H W"],
         scale_fg: Float[Tensor, ""] | None = None,
         scale_bg: Float[Tensor, ""] | None = None,
+        whole: Float[Tensor, ""] | None = None,
     ) -> Float[Tensor, " N"]:
+        if whole is not None:
+            args = (image, log_objects, objects, log_background, background, scale_fg, scale_bg)
+            channel, pixel = (PlainMixture(self.sigma_fg, self.sigma_bg, over) for over in ("channel", "pixel"))
+            return (1 - whole) * channel(*args) + whole * pixel(*args)
         sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
         by_object = log_normal(image[:, None], objects, sigma_fg)
         by_background = log_normal(image[:, None], background, sigma_bg)
@@ -111,7 +116,8 @@ class Straightforward(Apex):
         look_at, follow_in, features = self._sources(video, i, memory)
         found = self.discovery(features[:, 0], look_at, self.glimpses, self.appearance, noise)
         for _ in range(self.merges):
-            found = merged(self, found, video[:, i], look_at, context.schedule)
+            evidence = self._evidence(video[:, i], context.schedule)
+            found = merged(self, found, video[:, i], look_at, context.schedule, evidence)
         proposals = found.over_time((len(video), 1), None)
         step = self._infer(look_at, follow_in, proposals, memory, context.schedule, noise)
         return self._render(video[:, i : i + 1], proposals, step, memory, context, noise)
@@ -205,7 +211,9 @@ class Straightforward(Apex):
             x[:, 0] for x in (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)
         )
         paster = self.paster(place, alpha.shape[-1])
-        masks = self.masks.compose(alpha, presence, valid, paster)
+        evidence = self._evidence(frame[:, 0], context.schedule)
+        sharp = self.sharpened(alpha, what, place, evidence, context.schedule)
+        masks = self.masks.compose(sharp, presence, valid, paster)
         backdrop, kl_background = self._backdrop(frame[:, 0], masks, memory, noise)
         seen = Drawn(alpha, presence, valid, place, what)
         picture = self._picture(Part(), frame[:, 0], step.source, seen, paster, masks, backdrop, context)

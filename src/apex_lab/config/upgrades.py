@@ -25,6 +25,11 @@ ADDED: dict[str, Any] = {
     "model.untracked": "background",  # SCALOR
     "model.schedule": "rprp",  # OP3
     "clips.starts": "random",
+    "model.merges": 0,  # APEX, and the four below
+    "model.piece_price": 0.0,
+    "model.pixel_features": 0,
+    "model.whole_colours": False,
+    "model.background.shadow": 1.0,
 }
 """Keys added since `FORMAT` was raised, with the value that they had before they existed."""
 

@@ -139,7 +139,7 @@ def propose(model: Apex) -> Proposals:
 def everything() -> Iterator[None]:
     """Nothing is left out that holds nothing, as on a GPU."""
     with contextlib.ExitStack() as stack:
-        for module in ("nn.slots", "models.apex.model", "models.apex.parts", "models.apex.merging"):
+        for module in ("nn.slots", *(f"models.apex.{name}" for name in ("model", "parts", "merging", "likelihood"))):
             stack.enter_context(mock.patch(f"apex_lab.{module}.may_look", return_value=False))
         yield
 
@@ -203,10 +203,11 @@ class Inside:
             context: Context,
             noise: Noise | None,
             state_with: Callable[[Tensor], State],
+            evidence: Tensor | None,
         ) -> Scene:
             proposals.append(found)
             steps.append(left)
-            return explain(video, found, left, context, noise, state_with)
+            return explain(video, found, left, context, noise, state_with, evidence)
 
         def listen(z: torch.Tensor) -> torch.Tensor:
             backdrops.append(z)

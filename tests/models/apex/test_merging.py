@@ -304,7 +304,7 @@ def test_where_nobody_may_look_it_is_the_same(most: int, over: str, static: Call
     for _ in range(2):
         leaves = source.clone().requires_grad_()
         model.zero_grad()
-        after = merged(model, found, images, leaves, VALUES, most)
+        after = merged(model, found, images, leaves, VALUES, most=most)
         sum(value.square().sum() for _, value in fields(after)).backward()  # type: ignore[union-attr]
         weights = [w.grad for part in (model.appearance, model.glimpses.glimpse) for w in part.parameters()]
         results.append(([value for _, value in fields(after)], [leaves.grad, *weights]))

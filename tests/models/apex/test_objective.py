@@ -177,12 +177,12 @@ def place_of(height: float, width: float, y: float, x: float) -> torch.Tensor:
 def test_a_window_that_fits_its_block_of_pixels_is_not_loose() -> None:
     # rows 4 to 12 and columns 8 to 24 of 32: shares 1/4 and 1/2 of the side, centres -1/2 and 0
     masks, one = block(32, 4, 12, 8, 24)[None, None], torch.ones(1, 1, dtype=torch.float64)
-    fits = place_of(1.25 / 4, 1.25 / 2, -0.5, 0.0)
+    fits = place_of(1.6 / 4, 1.6 / 2, -0.5, 0.0)
     assert float(loose_windows(masks, fits[None, None], one)) == pytest.approx(0, abs=1e-12)
     smaller = place_of(0.2, 0.2, -0.5, 0.0)
     assert float(loose_windows(masks, smaller[None, None], one)) == pytest.approx(0, abs=1e-12)
-    loose = place_of(0.625, 0.9, -0.3, 0.25)
-    wanted = math.log(2) ** 2 + math.log(0.9 / 0.625) ** 2 + (0.2 / 0.625) ** 2 + (0.25 / 1.25) ** 2
+    loose = place_of(0.8, 0.9, -0.3, 0.25)
+    wanted = math.log(2) ** 2 + math.log(0.9 / 0.8) ** 2 + (0.2 / 0.8) ** 2 + (0.25 / 1.6) ** 2
     assert float(loose_windows(masks, loose[None, None], one)) == pytest.approx(wanted, rel=1e-9)
     assert float(loose_windows(masks, loose[None, None], 0.5 * one)) == pytest.approx(wanted / 2, rel=1e-9)
 

@@ -177,9 +177,9 @@ def test_the_terms_in_float32_are_those_in_float64() -> None:
         return type(x)(*(in_float32(y) for y in x))
 
     with torch.no_grad():
-        exact = model._explain(video(2, 4).double(), seen.proposals, seen.steps, CONTEXT, None, no_state)
+        exact = model._explain(video(2, 4).double(), seen.proposals, seen.steps, CONTEXT, None, no_state, None)
         found, steps = in_float32(seen.proposals), in_float32(seen.steps)
-        rounded = model.float()._explain(video(2, 4), found, steps, CONTEXT, None, no_state)  # type: ignore[arg-type]
+        rounded = model.float()._explain(video(2, 4), found, steps, CONTEXT, None, no_state, None)  # type: ignore[arg-type]
     for name, value in exact.terms.items():
         torch.testing.assert_close(rounded.terms[name].double(), value, rtol=1e-4, atol=1e-3)
     assert (rounded.masks - exact.masks).abs().max() < 1e-5

@@ -19,6 +19,7 @@ from tests.reference.grid import GridPaster, grid_crop
 
 ALL, AS_MANY = "straightforward", "straightforward, renders as many"
 MERGES = ("model.background.shadow=0.7", "model.merges=1", "model.start_size=0.4")
+PIXELS = ("model.pixel_features=4", "model.whole_colours=true", "model.piece_price=10")
 
 
 def pair(*words: str, twin: str = ALL) -> tuple[Apex, Straightforward, Context]:
@@ -54,9 +55,13 @@ def test_the_twin_gives_the_same_terms_masks_and_gradients(twin: str, words: tup
 
 
 @pytest.mark.parametrize("training", [False, True], ids=["evaluation", "training"])
-def test_the_twin_merges_and_casts_shadows_too(training: bool) -> None:
+@pytest.mark.parametrize("more", [(), PIXELS], ids=["", "pixels and whole colours, half way"])
+def test_the_twin_merges_and_casts_shadows_too(training: bool, more: tuple[str, ...]) -> None:
     torch.manual_seed(0)
-    model, other, context = pair(*MERGES, twin=AS_MANY)
+    model, other, context = pair(*MERGES, *more, twin=AS_MANY)
+    if model.pixels is not None:
+        torch.nn.init.normal_(model.pixels.query.weight)
+        context = replace(context, schedule={**context.schedule, **schedule_at({"refinement": 0.5})})
     spread(model.discovery.head_pres[-1], 0.0, 4.0, lambda: propose(model))
     other.load_state_dict(model.state_dict())
     for each in (model, other):

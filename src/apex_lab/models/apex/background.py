@@ -31,7 +31,7 @@ def shadowed(
     """
     with torch.no_grad():
         u = (image * backdrop).sum(-3, keepdim=True) / backdrop.square().sum(-3, keepdim=True).clamp_min(1e-6)
-        u = torch.maximum(u, torch.as_tensor(darkest, dtype=u.dtype, device=u.device)).clamp_max_(1.0)
+        u = u.clamp_min(darkest).clamp_max_(1.0)
     return backdrop * u
 
 

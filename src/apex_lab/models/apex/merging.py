@@ -95,9 +95,9 @@ def merged(
     model: Apex,
     found: Proposals,
     images: Float[Tensor, "F 3 H W"],
-    evidence: Float[Tensor, "F E H W"] | None,
     source: Float[Tensor, "F C h w"],
     schedule: Schedule,
+    evidence: Float[Tensor, "F E H W"] | None = None,
     most: int = 4,
 ) -> Proposals:
     """The proposals of F frames, in each of them at most one pair replaced by one object.
@@ -105,8 +105,9 @@ def merged(
     Args:
         model: what draws and judges.
         found: (F, D, ...).
-        images, evidence, source: the frames, their pixels' features if masks see them, and where glimpses are cut from.
+        images, source: the frames, and where glimpses are cut from.
         schedule: as the model is given it.
+        evidence: features of the frames' pixels, where masks see them.
         most: pairs of a frame that are judged.
     """
     with torch.no_grad():

@@ -194,7 +194,7 @@ class Apex(SceneModel):
                 steps, memory = roll_out(self, frames, claims, memory, context.schedule, plan.noise)
         with record_function("rendering"):
             return self._explain(
-                video, evidence, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z)
+                video, proposals, steps, context, noise, lambda z: State(encoder, video[:, -1], memory, z), evidence
             )
 
     def posterior(
@@ -310,18 +310,18 @@ class Apex(SceneModel):
             maps, noise = [x.index_select(0, frames) for x in maps], NoiseOfFrames(noise, frames, len(maps[0]))
         found = self.discovery(*maps, self.glimpses, self.appearance, noise)
         for _ in range(self.merges):
-            found = merged(self, found, images, evidence, maps[1], schedule)
+            found = merged(self, found, images, maps[1], schedule, evidence)
         return found
 
     def _explain(
         self,
         video: Tensor,
-        evidence: Tensor | None,
         proposals: Proposals,
         steps: Step,
         context: Context,
         noise: Noise | None,
         state_with: Callable[[Tensor], State],
+        evidence: Tensor | None,
     ) -> Scene:
         """Rendering, likelihood, KL and the result; no frame waits for another, so a GPU does all at once."""
         b, t = video.shape[:2]
