@@ -25,8 +25,9 @@ ADDED: dict[str, Any] = {
     "model.untracked": "background",  # SCALOR
     "model.schedule": "rprp",  # OP3
     "clips.starts": "random",
-    "model.merges": 0,  # APEX, and the four below
+    "model.merges": 0,  # APEX, and the five below
     "model.piece_price": 0.0,
+    "model.hollow_price": 0.0,
     "model.pixel_features": 0,
     "model.whole_colours": False,
     "model.background.shadow": 1.0,

@@ -14,6 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from apex_lab.models.apex.hulls import hollow
 from apex_lab.models.apex.masks import Masks
 from apex_lab.models.apex.objects import Proposals
 from apex_lab.models.apex.windows import window_of
@@ -89,6 +90,13 @@ def around(mask: Float[Tensor, "V H W"]) -> Float[Tensor, "V 4"]:
         size.append((MARGIN * (high - low) / n).clamp(2 / n, 0.95))
         centre.append((high + low) / n - 1)
     return torch.cat([torch.logit(torch.stack(size, -1)), torch.stack(centre, -1)], dim=-1)
+
+
+def gap(masks: Masks, pairs: Pairs) -> Float[Tensor, " V"]:
+    """Pixels of background in the convex hull of both, beyond those in the hull of each (see hulls.py)."""
+    owner = torch.cat([masks.background[:, None], masks.objects], dim=1).argmax(1)[pairs.frame]
+    first, second = (owner == 1 + x[:, None, None] for x in (pairs.first, pairs.second))
+    return hollow(first | second, owner == 0) - hollow(first, owner == 0) - hollow(second, owner == 0)
 
 
 def merged(
@@ -231,5 +239,5 @@ def _gain(
         schedule,
     )
     saved = known.cost[frame, first] + known.cost[frame, second] + known.stay[frame, second]
-    saved = saved + model.piece_price * schedule.get("refinement", 1.0)
-    return after - before[frame] + saved - kl_gaussian(q_what, standard_normal(q_what.mean))
+    priced = (model.piece_price - model.hollow_price * gap(alone, pairs)) * schedule.get("refinement", 1.0)
+    return after - before[frame] + saved + priced - kl_gaussian(q_what, standard_normal(q_what.mean))

@@ -69,6 +69,7 @@ class Apex(SceneModel):
             before noise drowns them; under the inclusive KL it costs 1 / (2 std^2) nats per dimension and object.
         merges: how often per frame two proposals of discovery may become one (see merging.py); the paper's is 0.
         piece_price: nats that the second of two such proposals has to be worth beyond its own cost.
+        hollow_price: nats that it costs the union of two such proposals per pixel of background between them.
         pixel_features: how many features of each pixel shift the mask logits (see pixels.py); the paper's is 0.
         whole_colours: whether the mixture of channels becomes one of whole colours as `refinement` goes to 1.
     """
@@ -82,9 +83,10 @@ class Apex(SceneModel):
         "discover": (0.0, 1.0),
         "sigma_fg_scale": (0.01, 100.0),
         "sigma_bg_scale": (0.01, 100.0),
+        "shadow": (0.0, 1.0),
         "refinement": (0.0, 1.0),
     }
-    optional_schedules = ("refinement",)
+    optional_schedules = ("shadow", "refinement")
 
     def __init__(
         self,
@@ -113,6 +115,7 @@ class Apex(SceneModel):
         start_std: Positive = 0.5,
         merges: Annotated[int, Field(ge=0)] = 0,
         piece_price: Annotated[float, Field(ge=0)] = 0.0,
+        hollow_price: Annotated[float, Field(ge=0)] = 0.0,
         pixel_features: Annotated[int, Field(ge=0)] = 0,
         whole_colours: bool = False,
     ) -> None:
@@ -128,7 +131,8 @@ class Apex(SceneModel):
         self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
         self.input_size = (image_size, image_size)
         self.render_top = min(render_top or grid**2, grid**2)
-        self.merges, self.piece_price, self.whole_colours = merges, piece_price, whole_colours
+        self.merges, self.piece_price, self.hollow_price = merges, piece_price, hollow_price
+        self.whole_colours = whole_colours
         self.has_posterior = isinstance(likelihood, MixtureLikelihood)
         self.direction, self.keep_threshold = kl, keep_threshold
         self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
@@ -163,8 +167,8 @@ class Apex(SceneModel):
                 multiplied by. A wide sigma_bg: the background first learns what it can, such as cast shadows, before
                 objects are asked to explain the rest. A wide sigma_fg: while objects cannot be drawn well yet, two
                 components of half an object gain less likelihood over one of the whole than the second one costs.
-                `refinement` (may be missing: 1), how much of what is not the paper's counts: cast shadows, pixels in
-                masks, whole colours in the mixture, the price of a piece.
+                `shadow` (may be missing: 1), how much of the background's shadow depth counts. `refinement` (may be
+                missing: 1), how much counts of pixels in masks, whole colours in the mixture and the prices of merging.
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
@@ -224,7 +228,7 @@ class Apex(SceneModel):
     ) -> Float[Tensor, "B T K 3 H W"]:
         """The components' images with cast shadows on that of the background."""
         assert scene.means is not None
-        cast = self.background.cast(scene.means, video[:, :, None].expand_as(scene.means), schedule.get("refinement"))
+        cast = self.background.cast(scene.means, video[:, :, None].expand_as(scene.means), schedule.get("shadow"))
         return torch.where(scene.background[:, None, None, None], cast, scene.means)
 
     def alpha(self, what: Float[Tensor, "*batch Z"]) -> Float[Tensor, "*batch g g"]:
@@ -240,7 +244,7 @@ class Apex(SceneModel):
         if bias is None:
             return self.pixels(images, images)
         empty = torch.sigmoid(bias.detach()).expand_as(images)
-        return self.pixels(images, self.background.cast(empty, images, schedule.get("refinement")))
+        return self.pixels(images, self.background.cast(empty, images, schedule.get("shadow")))
 
     def sharpened(
         self,
@@ -278,7 +282,7 @@ class Apex(SceneModel):
             masks.log_objects,
             means,
             masks.log_background,
-            self.background.seen(backdrop, images, schedule.get("refinement")),
+            self.background.seen(backdrop, images, schedule.get("shadow")),
             schedule["sigma_fg_scale"],
             schedule["sigma_bg_scale"],
             self._whole(schedule),
@@ -404,7 +408,7 @@ class Apex(SceneModel):
                 masks.objects,
                 means,
                 masks.background,
-                self.background.cast(backdrop, image, context.schedule.get("refinement")),
+                self.background.cast(backdrop, image, context.schedule.get("shadow")),
             ),
             log_likelihood,
             mask_entropy(masks),
