@@ -9,18 +9,7 @@ import torch
 from torch import Tensor
 
 from apex_lab.models.apex.hulls import hollow
-
-
-def reference(mask: Tensor, counted: Tensor, reach: float = 0.0) -> int:
-    """Counted pixels whose centre lies in the hull of the mask's pixel centres, or at most `reach` pixels outside."""
-    points = np.argwhere(mask.numpy())[:, ::-1].astype(np.float32)
-    if not len(points):
-        return 0
-    hull = cv2.convexHull(points)
-    return sum(
-        cv2.pointPolygonTest(hull, (float(x), float(y)), True) >= -reach - 1e-3
-        for y, x in np.argwhere(counted.numpy())
-    )
+from tests.models.apex.hull import hull_count
 
 
 def blobs(seed: int, count: int = 8, size: int = 40) -> Tensor:
@@ -38,7 +27,7 @@ def blobs(seed: int, count: int = 8, size: int = 40) -> Tensor:
 def test_the_polygon_is_the_hull_or_larger_by_less_than_a_pixel(seed: int) -> None:
     masks = blobs(seed)
     for mask, found in zip(masks, hollow(masks, ~masks).tolist(), strict=True):
-        assert reference(mask, ~mask) <= found <= reference(mask, ~mask, reach=0.7)
+        assert hull_count(mask, ~mask) <= found <= hull_count(mask, ~mask, reach=0.7)
 
 
 def test_upright_boxes_and_diamonds_are_their_own_hulls() -> None:

@@ -16,6 +16,7 @@ from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.scene import Context, schedule_at
 from tests.models.apex import naive
+from tests.models.apex.hull import hull_count
 from tests.models.apex.small import SCHEDULE, SIZE, lively, video
 
 SCALES = (1.25, 0.75)
@@ -232,6 +233,8 @@ def best_union(model: Apex, image: Tensor, source: Tensor, found: Proposals, f: 
     before = bound(model, image, cells, backdrops)
     before -= sum(naive.kl_presence(float(found.prob[f, d]), P0) for d in cells)
     by_cell = dict(zip(cells, masks, strict=True))
+    owner = torch.stack([m_bg, *masks]).argmax(0)
+    region = {d: owner == 1 + k for k, d in enumerate(cells)}
     lengths = {(a, b): rim(by_cell[a], by_cell[b]) for a, b in itertools.combinations(cells, 2)}
     judged = [pair for pair in sorted(lengths, key=lambda pair: -lengths[pair])[:4] if lengths[pair] > 4]
     best, most = None, before
@@ -248,6 +251,10 @@ def best_union(model: Apex, image: Tensor, source: Tensor, found: Proposals, f: 
         left = {d: (mean, std, place) if d == first else cell for d, cell in cells.items() if d != second}
         after = bound(model, image, left, backdrops)
         after -= sum(naive.kl_presence(float(found.prob[f, d]), P0) for d in left) + naive.kl_presence(0.0, P0)
+        a, b, both = (
+            hull_count(x, owner == 0) for x in (region[first], region[second], region[first] | region[second])
+        )
+        after += model.piece_price - model.hollow_price * (both - a - b)
         if after > most:
             best, most = (first, second, mean, std, place, hidden), after
     return best, len(judged)
@@ -292,6 +299,28 @@ def test_the_union_that_raises_the_bound_most_against_trying_them_all(shadow: fl
     assert tried > 6
     for name, value in fields(after):  # everything else stays, bit for bit
         assert torch.equal(value, want[name]), name
+
+
+PRICES = ((0.0, 0.0), (40.0, 0.0), (1000.0, 0.0), (1000.0, 10.0), (1000.0, 50.0), (1000.0, 100.0))
+"""piece_price and hollow_price."""
+
+
+def test_prices_change_which_pair_becomes_one() -> None:
+    model = small_model(1.0)
+    found = hand_made(model, training=False)
+    images, source = frames(model, found)
+    seen = set()
+    for model.piece_price, model.hollow_price in PRICES:
+        with torch.no_grad():
+            after = merged(model, found, images, source, VALUES)
+        want = []
+        for f in range(6):
+            best, _ = best_union(model, images[f], source[f], found, f)
+            want.append(None if best is None else best[1])
+        gone = [(p == 0).nonzero().squeeze(1).tolist() for p in after.prob]
+        assert gone == [[] if cell is None else [cell] for cell in want]
+        seen.add(tuple(want))
+    assert len(seen) >= 4
 
 
 @pytest.mark.parametrize("over", ["channel", "pixel"])

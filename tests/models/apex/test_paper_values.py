@@ -46,8 +46,8 @@ def test_the_refined_recipe_shrinks_windows_once_objects_are_there_and_refines_l
     loose = components.build(config["loss"]["loose_windows"], "loss.loose_windows")
     assert [loose(step) for step in (0, 500, 1_000, 1_500, 8_000)] == [0.0, 0.0, 100.0, 200.0, 200.0]
     assert config["loss"]["kl_pres"] == 8.0
-    refinement = components.build(config["schedule"]["refinement"], "schedule.refinement")
-    assert [refinement(step) for step in (0, 3_000, 3_250, 3_500, 8_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    shadow = components.build(config["schedule"]["shadow"], "schedule.shadow")
+    assert [shadow(step) for step in (0, 3_000, 3_250, 3_500, 8_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
     rate = components.build(config["lr_scale"], "lr_scale")
     assert (rate(3_000), rate(config["trainer"]["max_steps"])) == (1.0, pytest.approx(0.05))
 
@@ -55,5 +55,5 @@ def test_the_refined_recipe_shrinks_windows_once_objects_are_there_and_refines_l
 @pytest.mark.parametrize("scale", ["paper", "cpu", "quickstart"])
 def test_refinements_are_off_unless_an_experiment_names_them(scale: str) -> None:
     model = resolved("model=apex", "data=p2d", f"scale={scale}")["model"]
-    assert (model["merges"], model["piece_price"], model["pixel_features"]) == (0, 0.0, 0)
+    assert (model["merges"], model["piece_price"], model["hollow_price"], model["pixel_features"]) == (0, 0.0, 0.0, 0)
     assert model["background"]["shadow"] == 1.0

@@ -239,5 +239,5 @@ def _gain(
         schedule,
     )
     saved = known.cost[frame, first] + known.cost[frame, second] + known.stay[frame, second]
-    priced = (model.piece_price - model.hollow_price * gap(alone, pairs)) * schedule.get("refinement", 1.0)
-    return after - before[frame] + saved + priced - kl_gaussian(q_what, standard_normal(q_what.mean))
+    saved = saved + model.piece_price - model.hollow_price * gap(alone, pairs)
+    return after - before[frame] + saved - kl_gaussian(q_what, standard_normal(q_what.mean))

@@ -168,7 +168,7 @@ class Apex(SceneModel):
                 objects are asked to explain the rest. A wide sigma_fg: while objects cannot be drawn well yet, two
                 components of half an object gain less likelihood over one of the whole than the second one costs.
                 `shadow` (may be missing: 1), how much of the background's shadow depth counts. `refinement` (may be
-                missing: 1), how much counts of pixels in masks, whole colours in the mixture and the prices of merging.
+                missing: 1), how much counts of pixels in masks and of whole colours in the mixture.
         """
         if video.shape[-2:] != (self.image_size, self.image_size):
             raise ValueError(f"the model was built for {self.image_size} px images, the video has {video.shape[-2:]}")
