@@ -58,6 +58,11 @@ def any_of(mask: Bool[Tensor, "..."]) -> bool:
     return not may_look(mask) or bool(mask.any())
 
 
+def none_of(values: Float[Tensor, "..."]) -> bool:
+    """Whether all are zero; false where nobody may look."""
+    return may_look(values) and not bool(values.any())
+
+
 def filled(valid: Bool[Tensor, "B P"]) -> Int[Tensor, "B n"] | None:
     """The slots that hold something, filled up with empty ones to those of the fullest row, at least one.
 

@@ -81,7 +81,7 @@ def test_untrained_masks_are_those_of_codes_alone() -> None:
     torch.testing.assert_close(a.masks, b.masks, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("refinement", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("refinement", [0.5, 1.0])
 def test_refinement_is_how_much_of_the_shift_counts(refinement: float) -> None:
     model = small.tiny(pixel_features=4).double()
     assert model.pixels is not None
@@ -95,6 +95,21 @@ def test_refinement_is_how_much_of_the_shift_counts(refinement: float) -> None:
     shift = model.pixels.shifts(features, what, window_of(place), 8)
     assert shift.abs().max() > 0.01
     torch.testing.assert_close(got, 5.0 * torch.tanh(raw + refinement * shift), rtol=1e-6, atol=1e-6)
+
+
+def test_pixels_that_do_not_count_cost_nothing_and_have_gradients_of_zero() -> None:
+    model = small.tiny(pixel_features=4).double()
+    assert model.pixels is not None
+    torch.nn.init.normal_(model.pixels.query.weight)
+    values = dict(small.SCHEDULE) | {"refinement": torch.zeros((), dtype=torch.float64)}
+    assert model._evidence(numbers(2, 3, small.SIZE, small.SIZE), values) is None
+    what, place, alpha = numbers(2, 3, 6), numbers(2, 3, 4), numbers(2, 3, 8, 8)
+    got = model.sharpened(alpha, what, place, None, values)
+    assert torch.equal(got, alpha)
+    got.sum().backward()
+    for name, weight in model.pixels.named_parameters():
+        assert weight.grad is not None, name
+        assert not weight.grad.any(), name
 
 
 def test_a_missing_refinement_counts_in_full() -> None:

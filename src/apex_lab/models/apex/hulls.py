@@ -22,8 +22,7 @@ def hollow(mask: Bool[Tensor, "V H W"], counted: Bool[Tensor, "V H W"]) -> Float
     than a pixel at the sizes of objects.
     """
     h, w = mask.shape[-2:]
-    to = {"device": mask.device, "dtype": torch.float32}
-    rows, columns = torch.arange(h, **to), torch.arange(w, **to)
+    rows, columns = (torch.arange(n, device=mask.device, dtype=torch.float32) for n in (h, w))
     angle = torch.arange(DIRECTIONS, device=mask.device, dtype=torch.float64) * (2 * math.pi / DIRECTIONS)
     # In exact quarters: a sine of 1e-17 would turn a tangent along the rows into a division by it
     along_x, along_y = (x.round(decimals=12).float() for x in (angle.cos(), angle.sin()))

@@ -107,8 +107,9 @@ def merged(
     schedule: Schedule,
     evidence: Float[Tensor, "F E H W"] | None = None,
     most: int = 4,
+    rounds: int = 1,
 ) -> Proposals:
-    """The proposals of F frames, in each of them at most one pair replaced by one object.
+    """The proposals of F frames, in each of them at most one pair per round replaced by one object.
 
     Args:
         model: what draws and judges.
@@ -117,22 +118,69 @@ def merged(
         schedule: as the model is given it.
         evidence: features of the frames' pixels, where masks see them.
         most: pairs of a frame that are judged.
+        rounds: how often; a frame without a gain in one has none in the next.
     """
+    look = may_look(found.prob)
+    seen = Seen(images, source, evidence, torch.arange(len(images), device=images.device) if look else None)
+    for _ in range(rounds):
+        found, changed = _round(model, found, seen, schedule, most)
+        if look:
+            seen = Seen(images, source, evidence, changed)
+            if not len(changed):
+                break
+    return found
+
+
+class Seen(NamedTuple):
+    """All F frames of a pass, and those of them that a round looks at (None: all)."""
+
+    images: Tensor
+    source: Tensor
+    evidence: Tensor | None
+    frames: Int[Tensor, " N"] | None
+
+    def of(self, values: Tensor) -> Tensor:
+        """Values (F, ...) at the frames that are looked at."""
+        return values if self.frames is None else values.index_select(0, self.frames)
+
+
+def _round(
+    model: Apex, found: Proposals, seen: Seen, schedule: Schedule, most: int
+) -> tuple[Proposals, Int[Tensor, " n"]]:
+    """The proposals after a round, and in which frames something changed (where nobody may look: anything)."""
     with torch.no_grad():
-        known = _known(model, found, evidence, schedule)
+        evidence = None if seen.evidence is None else seen.of(seen.evidence)
+        known = _known(model, _at(found, seen), evidence, schedule)
         alone = _composed(model, known.alpha, known.place, known.there)
         pairs = touching(alone.objects, known.there, most)
     if not len(pairs.frame):
-        return found
-    code = model.glimpses.look(source[pairs.frame], window_of(pairs.place)[:, None]).squeeze(1)
+        return found, pairs.frame
+    here = pairs.frame  # among the frames that are looked at
+    pairs = pairs._replace(frame=here if seen.frames is None else seen.frames[here])
+    code = model.glimpses.look(seen.source[pairs.frame], window_of(pairs.place)[:, None]).squeeze(1)
     nothing = code.new_zeros(len(code), model.appearance.what), code.new_zeros(len(code), model.hidden)
     q_what, hidden = model.appearance(code, *nothing)
     with torch.no_grad():
-        gain = _gain(model, images, evidence, schedule, known, alone, pairs, q_what).masked_fill(
-            ~pairs.valid, -torch.inf
-        )
-        chosen = best_of(gain, pairs.frame, len(images))
-    return _replaced(found, known.top, pairs, chosen, q_what, hidden)
+        judged = pairs._replace(frame=here)
+        images = seen.of(seen.images)
+        if seen.frames is not None:  # the others need no second look
+            few, at = here.unique(return_inverse=True)
+            judged, images = pairs._replace(frame=at), images.index_select(0, few)
+            evidence = None if evidence is None else evidence.index_select(0, few)
+            known = Known(*(x.index_select(0, few) for x in known))
+            alone = Masks(*(x.index_select(0, few) for x in alone))
+            top = known.top[at]
+        else:
+            top = known.top[here]
+        gain = _gain(model, images, evidence, schedule, known, alone, judged, q_what)
+        chosen = best_of(gain.masked_fill(~pairs.valid, -torch.inf), pairs.frame, len(found.prob))
+    return _replaced(found, top, pairs, chosen, q_what, hidden), pairs.frame[chosen]
+
+
+def _at(found: Proposals, seen: Seen) -> Proposals:
+    """The proposals of the frames that are looked at."""
+    q_where, q_what = (Gaussian(*map(seen.of, q)) for q in found[:2])
+    return Proposals(q_where, q_what, *map(seen.of, found[2:]))
 
 
 def best_of(gain: Float[Tensor, " V"], frame: Int[Tensor, " V"], frames: int) -> Bool[Tensor, " V"]:
@@ -147,9 +195,9 @@ def best_of(gain: Float[Tensor, " V"], frame: Int[Tensor, " V"], frames: int) ->
 def _replaced(
     found: Proposals, top: Tensor, pairs: Pairs, chosen: Bool[Tensor, " V"], q_what: Gaussian, hidden: Tensor
 ) -> Proposals:
-    """The proposals with the chosen pairs' first ones replaced and their second ones gone."""
+    """The proposals with the chosen pairs' first ones replaced and their second ones gone; top (V, n): their cells."""
     frames, cells = found.prob.shape
-    spot, gone = (pairs.frame * cells + top[pairs.frame, x] for x in (pairs.first, pairs.second))
+    spot, gone = (pairs.frame * cells + top.gather(1, x[:, None]).squeeze(1) for x in (pairs.first, pairs.second))
     noise = ((found.what - found.q_what.mean) / found.q_what.std).detach()  # what each cell's sample was drawn with
     what = q_what.mean + q_what.std * noise.flatten(0, 1)[spot]
     if may_look(found.prob):

@@ -29,7 +29,7 @@ from apex_lab.models.apex.windows import Windows, size_logit, window_of
 from apex_lab.nn.blocks import SubpixelDecoder
 from apex_lab.nn.distributions import kl_gaussian
 from apex_lab.nn.shared import gathered_gradients
-from apex_lab.nn.slots import may_look
+from apex_lab.nn.slots import may_look, none_of
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.scene import Context, Noise, Scene, SceneModel, Schedule, Statistics
 
@@ -237,8 +237,8 @@ class Apex(SceneModel):
         return self.masks.logits(raw).reshape(*what.shape[:-1], *raw.shape[-2:])
 
     def _evidence(self, images: Float[Tensor, "F 3 H W"], schedule: Schedule) -> Float[Tensor, "F C H W"] | None:
-        """Features of pixels that masks may see; None where there are none."""
-        if self.pixels is None:
+        """Features of pixels that masks may see; None where there are none, or where they would not count."""
+        if self.pixels is None or none_of(schedule.get("refinement", images.new_ones(()))):
             return None
         bias = self.background.bias_image
         if bias is None:
@@ -255,8 +255,10 @@ class Apex(SceneModel):
         schedule: Schedule,
     ) -> Float[Tensor, "N n g g"]:
         """Mask logits of components of N frames with what their pixels say."""
-        if self.pixels is None or evidence is None:
+        if self.pixels is None:
             return alpha
+        if evidence is None:
+            return alpha + self.pixels.nothing()
         shift = self.pixels.shifts(evidence, what, window_of(place), alpha.shape[-1])
         return self.masks.logits(self.masks.raw(alpha) + shift * schedule.get("refinement", 1.0))
 
@@ -313,8 +315,8 @@ class Apex(SceneModel):
             evidence = None if evidence is None else evidence.index_select(0, frames)
             maps, noise = [x.index_select(0, frames) for x in maps], NoiseOfFrames(noise, frames, len(maps[0]))
         found = self.discovery(*maps, self.glimpses, self.appearance, noise)
-        for _ in range(self.merges):
-            found = merged(self, found, images, maps[1], schedule, evidence)
+        if self.merges:
+            found = merged(self, found, images, maps[1], schedule, evidence, rounds=self.merges)
         return found
 
     def _explain(

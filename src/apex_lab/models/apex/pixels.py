@@ -61,3 +61,7 @@ class PixelEvidence(nn.Module):
         side = features.shape[-1]
         agreement = (self.query(what) @ features.flatten(2)).view(-1, 1, side, side)
         return crop(agreement, window.detach().reshape(-1, 1, 4), size).view(*what.shape[:2], size, size)
+
+    def nothing(self) -> Float[Tensor, ""]:
+        """Zero, on which all weights depend: they have gradients, of zero, where pixels do not count."""
+        return sum((weight.flatten()[0] * 0 for weight in self.parameters()), start=self.query.weight.new_zeros(()))
