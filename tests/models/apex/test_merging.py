@@ -254,7 +254,7 @@ def best_union(model: Apex, image: Tensor, source: Tensor, found: Proposals, f: 
         a, b, both = (
             hull_count(x, owner == 0) for x in (region[first], region[second], region[first] | region[second])
         )
-        after += model.piece_price - model.hollow_price * (both - a - b)
+        after += model.piece_price * lengths[pair] - model.hollow_price * (both - a - b)
         if after > most:
             best, most = (first, second, mean, std, place, hidden), after
     return best, len(judged)
@@ -301,7 +301,7 @@ def test_the_union_that_raises_the_bound_most_against_trying_them_all(shadow: fl
         assert torch.equal(value, want[name]), name
 
 
-PRICES = ((0.0, 0.0), (40.0, 0.0), (1000.0, 0.0), (1000.0, 10.0), (1000.0, 50.0), (1000.0, 100.0))
+PRICES = ((0.0, 0.0), (5.0, 0.0), (100.0, 0.0), (100.0, 10.0), (100.0, 50.0), (100.0, 100.0))
 """piece_price and hollow_price."""
 
 

@@ -36,13 +36,14 @@ class Pairs(NamedTuple):
     """V pairs of components, each of one of F frames; the first is the larger one.
 
     frame (V,): of which frame. first, second (V,): which of its n components. valid (V,): they touch.
-    place (V, 4): the window around both.
+    rim (V,): pixels along which they meet. place (V, 4): the window around both.
     """
 
     frame: Int[Tensor, " V"]
     first: Int[Tensor, " V"]
     second: Int[Tensor, " V"]
     valid: Bool[Tensor, " V"]
+    rim: Float[Tensor, " V"]
     place: Float[Tensor, "V 4"]
 
 
@@ -70,14 +71,14 @@ def touching(masks: Float[Tensor, "F n H W"], there: Bool[Tensor, "F n"], most: 
     length = torch.minimum(shared, shared.transpose(1, 2))[:, a, b] * (there[:, a] & there[:, b])
     length, which = length.topk(min(most, len(a)), dim=1)
     frame = torch.arange(len(masks), device=masks.device)[:, None].expand_as(which)
-    frame, a, b, valid = (x.flatten() for x in (frame, a[which], b[which], length > TOUCHING))
+    frame, a, b, valid, length = (x.flatten() for x in (frame, a[which], b[which], length > TOUCHING, length))
     if may_look(masks):
         chosen = valid.nonzero().squeeze(1)
-        frame, a, b, valid = (x.index_select(0, chosen) for x in (frame, a, b, valid))
+        frame, a, b, valid, length = (x.index_select(0, chosen) for x in (frame, a, b, valid, length))
     area = masks.sum((-2, -1))
     larger = area[frame, a] >= area[frame, b]
     first, second = torch.where(larger, a, b), torch.where(larger, b, a)
-    return Pairs(frame, first, second, valid, around(masks[frame, first] + masks[frame, second]))
+    return Pairs(frame, first, second, valid, length, around(masks[frame, first] + masks[frame, second]))
 
 
 def around(mask: Float[Tensor, "V H W"]) -> Float[Tensor, "V 4"]:
@@ -287,5 +288,5 @@ def _gain(
         schedule,
     )
     saved = known.cost[frame, first] + known.cost[frame, second] + known.stay[frame, second]
-    saved = saved + model.piece_price - model.hollow_price * gap(alone, pairs)
+    saved = saved + model.piece_price * pairs.rim - model.hollow_price * gap(alone, pairs)
     return after - before[frame] + saved - kl_gaussian(q_what, standard_normal(q_what.mean))

@@ -68,8 +68,8 @@ class Apex(SceneModel):
         start_std: standard deviation of q(z_what) at the start of training. A narrow one lets codes reach the decoders
             before noise drowns them; under the inclusive KL it costs 1 / (2 std^2) nats per dimension and object.
         merges: how often per frame two proposals of discovery may become one (see merging.py); the paper's is 0.
-        piece_price: nats that the second of two such proposals has to be worth beyond its own cost.
-        hollow_price: nats that it costs the union of two such proposals per pixel of background between them.
+        piece_price: nats that two such proposals cost beyond their own per pixel of the rim along which they meet.
+        hollow_price: nats that their union costs per pixel of background between them (see `merging.gap`).
         pixel_features: how many features of each pixel shift the mask logits (see pixels.py); the paper's is 0.
         whole_colours: whether the mixture of channels becomes one of whole colours as `refinement` goes to 1.
     """
