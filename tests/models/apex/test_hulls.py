@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from apex_lab.models.apex.hulls import hollow
-from tests.models.apex.hull import hull_count
+from tests.models.apex.hull import hull_count, in_tangents
 
 
 def blobs(seed: int, count: int = 8, size: int = 40) -> Tensor:
@@ -27,6 +27,7 @@ def blobs(seed: int, count: int = 8, size: int = 40) -> Tensor:
 def test_the_polygon_is_the_hull_or_larger_by_less_than_a_pixel(seed: int) -> None:
     masks = blobs(seed)
     for mask, found in zip(masks, hollow(masks, ~masks).tolist(), strict=True):
+        assert found == in_tangents(mask, ~mask)
         assert hull_count(mask, ~mask) <= found <= hull_count(mask, ~mask, reach=0.7)
 
 

@@ -16,7 +16,7 @@ from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian
 from apex_lab.scene import Context, schedule_at
 from tests.models.apex import naive
-from tests.models.apex.hull import hull_count
+from tests.models.apex.hull import in_tangents
 from tests.models.apex.small import SCHEDULE, SIZE, lively, video
 
 SCALES = (1.25, 0.75)
@@ -252,7 +252,7 @@ def best_union(model: Apex, image: Tensor, source: Tensor, found: Proposals, f: 
         after = bound(model, image, left, backdrops)
         after -= sum(naive.kl_presence(float(found.prob[f, d]), P0) for d in left) + naive.kl_presence(0.0, P0)
         a, b, both = (
-            hull_count(x, owner == 0) for x in (region[first], region[second], region[first] | region[second])
+            in_tangents(x, owner == 0) for x in (region[first], region[second], region[first] | region[second])
         )
         after += model.piece_price * lengths[pair] - model.hollow_price * (both - a - b)
         if after > most:

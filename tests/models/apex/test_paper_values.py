@@ -41,19 +41,24 @@ def test_sigma_fg_at_the_ends_of_a_training(scale: str, first: float, last: floa
     assert (sigma_fg(0), sigma_fg(config["trainer"]["max_steps"])) == (first, last)
 
 
-def test_the_refined_recipe_shrinks_windows_once_objects_are_there_and_refines_later() -> None:
-    config = resolved("model=apex", "data=p2d", "scale=cpu", "+experiment=refined")
+def test_the_recipe_of_p2d_shrinks_windows_once_objects_are_there_and_refines_later() -> None:
+    config = resolved("model=apex", "data=p2d", "scale=cpu")
     loose = components.build(config["loss"]["loose_windows"], "loss.loose_windows")
-    assert [loose(step) for step in (0, 500, 1_000, 1_500, 8_000)] == [0.0, 0.0, 100.0, 200.0, 200.0]
+    assert [loose(step) for step in (0, 500, 1_000, 1_500, 10_000)] == [0.0, 0.0, 100.0, 200.0, 200.0]
     assert config["loss"]["kl_pres"] == 8.0
     shadow = components.build(config["schedule"]["shadow"], "schedule.shadow")
-    assert [shadow(step) for step in (0, 3_000, 3_250, 3_500, 8_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    assert [shadow(step) for step in (0, 3_000, 3_250, 3_500, 10_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    refinement = components.build(config["schedule"]["refinement"], "schedule.refinement")
+    assert [refinement(step) for step in (0, 7_000, 7_250, 7_500, 10_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
     rate = components.build(config["lr_scale"], "lr_scale")
     assert (rate(3_000), rate(config["trainer"]["max_steps"])) == (1.0, pytest.approx(0.05))
 
 
-@pytest.mark.parametrize("scale", ["paper", "cpu", "quickstart"])
-def test_refinements_are_off_unless_an_experiment_names_them(scale: str) -> None:
-    model = resolved("model=apex", "data=p2d", f"scale={scale}")["model"]
+@pytest.mark.parametrize(
+    ("data", "scale"), [("p2d", "paper"), ("p2d", "smoke"), ("sprites", "cpu"), ("sketchy", "paper")]
+)
+def test_what_is_not_the_papers_is_off_elsewhere(data: str, scale: str) -> None:
+    model = resolved("model=apex", f"data={data}", f"scale={scale}")["model"]
     assert (model["merges"], model["piece_price"], model["hollow_price"], model["pixel_features"]) == (0, 0.0, 0.0, 0)
     assert model["background"]["shadow"] == 1.0
+    assert not model["whole_colours"]

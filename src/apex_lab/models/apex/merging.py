@@ -122,13 +122,12 @@ def merged(
         rounds: how often; a frame without a gain in one has none in the next.
     """
     look = may_look(found.prob)
-    seen = Seen(images, source, evidence, torch.arange(len(images), device=images.device) if look else None)
+    frames = ((found.prob > 0.5).sum(1) > 1).nonzero().squeeze(1) if look else None
     for _ in range(rounds):
-        found, changed = _round(model, found, seen, schedule, most)
-        if look:
-            seen = Seen(images, source, evidence, changed)
-            if not len(changed):
-                break
+        if frames is not None and not len(frames):
+            break
+        found, changed = _round(model, found, Seen(images, source, evidence, frames), schedule, most)
+        frames = changed if look else None
     return found
 
 
@@ -225,7 +224,10 @@ def _replaced(
 
 
 def _known(model: Apex, found: Proposals, evidence: Tensor | None, schedule: Schedule) -> Known:
-    prob, top = found.prob.topk(min(model.render_top, found.prob.shape[1]), dim=1)
+    most = min(model.render_top, found.prob.shape[1])
+    if may_look(found.prob):  # those that are there come first
+        most = min(most, int((found.prob > 0.5).sum(1).max()))
+    prob, top = found.prob.topk(most, dim=1)
     what, place = gather_slots(found.q_what.mean, top), gather_slots(found.place, top)
     cost = kl_gaussian(found.q_what, standard_normal(found.q_what.mean))
     stay, away = (kl_bernoulli(x, schedule["discovery_presence"]) for x in (prob, torch.zeros_like(prob)))
