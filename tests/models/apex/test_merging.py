@@ -323,17 +323,36 @@ def test_prices_change_which_pair_becomes_one() -> None:
     assert len(seen) >= 4
 
 
-@pytest.mark.parametrize("over", ["channel", "pixel"])
+@pytest.mark.parametrize("training", [False, True], ids=["means", "samples"])
+def test_rounds_are_one_after_the_other(training: bool) -> None:
+    model = small_model(0.7)
+    model.piece_price = 5.0
+    found = hand_made(model, training)
+    images, source = frames(model, found)
+    with torch.no_grad():
+        once = merged(model, found, images, source, VALUES)
+        thrice = merged(model, found, images, source, VALUES, rounds=3)
+        for _ in range(2):
+            once = merged(model, once, images, source, VALUES)
+    gone = ((thrice.prob == 0).sum(1)).tolist()
+    assert max(gone) > 1
+    assert min(gone) < max(gone)
+    for (name, a), (_, b) in zip(fields(once), fields(thrice), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-12, msg=name)
+
+
+@pytest.mark.parametrize(("over", "rounds"), [("channel", 1), ("channel", 3), ("pixel", 1)])
 @pytest.mark.parametrize("most", [1, 4])
-def test_where_nobody_may_look_it_is_the_same(most: int, over: str, static: Callable[[], None]) -> None:
+def test_where_nobody_may_look_it_is_the_same(most: int, over: str, rounds: int, static: Callable[[], None]) -> None:
     model = small_model(0.7, over)
+    model.piece_price, model.hollow_price = (0.0, 0.0) if rounds == 1 else (50.0, 1.0)
     found = hand_made(model, True)
     images, source = frames(model, found)
     results = []
     for _ in range(2):
         leaves = source.clone().requires_grad_()
         model.zero_grad()
-        after = merged(model, found, images, leaves, VALUES, most=most)
+        after = merged(model, found, images, leaves, VALUES, most=most, rounds=rounds)
         sum(value.square().sum() for _, value in fields(after)).backward()  # type: ignore[union-attr]
         weights = [w.grad for part in (model.appearance, model.glimpses.glimpse) for w in part.parameters()]
         results.append(([value for _, value in fields(after)], [leaves.grad, *weights]))
