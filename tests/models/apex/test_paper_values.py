@@ -49,7 +49,7 @@ def test_the_recipe_of_p2d_shrinks_windows_once_objects_are_there_and_refines_la
     shadow = components.build(config["schedule"]["shadow"], "schedule.shadow")
     assert [shadow(step) for step in (0, 3_000, 3_250, 3_500, 10_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
     refinement = components.build(config["schedule"]["refinement"], "schedule.refinement")
-    assert [refinement(step) for step in (0, 7_000, 7_250, 7_500, 10_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    assert [refinement(step) for step in (0, 9_000, 9_250, 9_500, 10_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
     rate = components.build(config["lr_scale"], "lr_scale")
     assert (rate(3_000), rate(config["trainer"]["max_steps"])) == (1.0, pytest.approx(0.05))
 
