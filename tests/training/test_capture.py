@@ -30,7 +30,10 @@ MOVING = tuple(
 )
 """Schedules that change at every step."""
 MUON = ("optimizer._target_=apex_lab.training.optimizers.Muon",)
-MERGES = ("model.background.shadow=0.7", "model.merges=1", "model.start_presence=0.9", "model.start_size=0.4")
+MERGES = (
+    *("model.background.shadow=0.7", "model.merges=2", "model.piece_price=20", "model.hollow_price=10"),
+    *("model.pixel_features=4", "model.whole_colours=true", "model.start_presence=0.9", "model.start_size=0.4"),
+)
 SCALED = ("lr_scale={_target_: apex_lab.training.schedules.Linear, start: 1.0, end: 0.5, steps: 20}",)
 
 

@@ -147,7 +147,7 @@ class Seen(NamedTuple):
 def _round(
     model: Apex, found: Proposals, seen: Seen, schedule: Schedule, most: int
 ) -> tuple[Proposals, Int[Tensor, " n"]]:
-    """The proposals after a round, and in which frames something changed (where nobody may look: anything)."""
+    """The proposals after a round, and in which frames something changed; where nobody may look, may have."""
     with torch.no_grad():
         evidence = None if seen.evidence is None else seen.of(seen.evidence)
         known = _known(model, _at(found, seen), evidence, schedule)
@@ -174,7 +174,8 @@ def _round(
             top = known.top[here]
         gain = _gain(model, images, evidence, schedule, known, alone, judged, q_what)
         chosen = best_of(gain.masked_fill(~pairs.valid, -torch.inf), pairs.frame, len(found.prob))
-    return _replaced(found, top, pairs, chosen, q_what, hidden), pairs.frame[chosen]
+    changed = pairs.frame if seen.frames is None else pairs.frame[chosen]
+    return _replaced(found, top, pairs, chosen, q_what, hidden), changed
 
 
 def _at(found: Proposals, seen: Seen) -> Proposals:
