@@ -1,9 +1,9 @@
 """Recorded numbers: refactorings may not move them.
 
-tests/pinned/numbers.json holds the losses and gradient norms of APEX's first steps at two scales, recorded when its
-feature maps became channels last on a CPU (cpu) and when what holds nothing was left out there (smoke), which changed
-rounding alone, and the scores of the shipped weights on four test videos, recorded at commit 3fe8b97.
-tests/pinned/format_1 holds a finished run of that commit.
+tests/pinned/numbers.json holds the losses and gradient norms of APEX's first steps at two scales, recorded when P2D got
+its own recipe (cpu) and when what holds nothing was left out on a CPU (smoke), which changed rounding alone, and the
+scores of the shipped weights on four test videos, recorded when they were shipped.
+tests/pinned/format_1 holds a finished run of commit 3fe8b97.
 """
 
 from __future__ import annotations
