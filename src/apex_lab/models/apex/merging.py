@@ -169,9 +169,7 @@ def _round(
             evidence = None if evidence is None else evidence.index_select(0, few)
             known = Known(*(x.index_select(0, few) for x in known))
             alone = Masks(*(x.index_select(0, few) for x in alone))
-            top = known.top[at]
-        else:
-            top = known.top[here]
+        top = known.top[judged.frame]
         gain = _gain(model, images, evidence, schedule, known, alone, judged, q_what)
         chosen = best_of(gain.masked_fill(~pairs.valid, -torch.inf), pairs.frame, len(found.prob))
     changed = pairs.frame if seen.frames is None else pairs.frame[chosen]
@@ -291,5 +289,7 @@ def _gain(
         schedule,
     )
     saved = known.cost[frame, first] + known.cost[frame, second] + known.stay[frame, second]
-    saved = saved + model.piece_price * pairs.rim - model.hollow_price * gap(alone, pairs)
+    saved = saved + model.piece_price * pairs.rim
+    if model.hollow_price:
+        saved = saved - model.hollow_price * gap(alone, pairs)
     return after - before[frame] + saved - kl_gaussian(q_what, standard_normal(q_what.mean))
