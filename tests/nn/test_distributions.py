@@ -45,6 +45,16 @@ def test_kl_bernoulli() -> None:
     assert kl_bernoulli(torch.tensor([0.0, 1.0]), torch.tensor([1.0, 0.0])).isfinite().all()
 
 
+def test_kl_bernoulli_of_certain_things_in_half_precision() -> None:
+    q, p = torch.tensor([0.0, 0.9995, 1.0, 1.0]), torch.tensor([0.25, 0.5, 0.5, 0.0])
+    half = q.bfloat16().requires_grad_()  # all but the first round to 1 or are it
+    found = kl_bernoulli(half, p.bfloat16())
+    torch.testing.assert_close(found, kl_bernoulli(q.bfloat16().float(), p))
+    found.sum().backward()
+    assert half.grad is not None
+    assert half.grad.isfinite().all()
+
+
 def test_relaxed_bernoulli_is_above_one_half_as_often_as_it_should() -> None:
     torch.manual_seed(1)
     for prob in (0.03, 0.4, 0.95):

@@ -60,6 +60,7 @@ def kl_bernoulli(
         added: in place of `tiny`, they stay as they are, and this is added inside every logarithm: for priors such as
             1e-10, where 1 - p rounds to 1.
     """
+    q, p = full(q), full(p)  # in half a precision 1 - tiny is 1, and its logarithm no number
     if added is None:
         q, p = q.clamp(tiny, 1 - tiny), p.clamp(tiny, 1 - tiny)
         return q * (q.log() - p.log()) + (1 - q) * ((-q).log1p() - (-p).log1p())

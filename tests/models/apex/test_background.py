@@ -121,4 +121,6 @@ def test_a_background_is_seen_as_decoded_and_with_shadows_if_it_may_have_any() -
     assert torch.equal(plain.seen(backdrop, image), backdrop[:, None])
     cast = shadowed(backdrop, image, 0.6)
     assert torch.equal(dark.cast(backdrop, image), cast)
+    half = dark.cast(backdrop, image, torch.tensor(0.5, dtype=torch.float64))
+    torch.testing.assert_close(half, shadowed(backdrop, image, 0.8))
     assert torch.equal(dark.seen(backdrop, image), torch.stack([backdrop, cast], 1))

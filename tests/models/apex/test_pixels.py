@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import pytest
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
-from apex_lab.models.apex import ApexNormalisation, ScalorNormalisation
+from apex_lab.models.apex import ApexNormalisation, Background, MixtureLikelihood, ScalorNormalisation
 from apex_lab.models.apex.pixels import PixelEvidence
 from apex_lab.models.apex.windows import window_of
 from apex_lab.scene import Context, schedule_at
@@ -49,6 +52,17 @@ def test_features_see_the_image_and_its_difference_from_the_empty_scene_alone() 
     torch.testing.assert_close(model(image, empty), want)
 
 
+def test_images_may_be_wider_than_high() -> None:
+    model = evidence()
+    what, window = numbers(2, 3, 6) - 0.5, torch.tensor([0.5, 0.5, 0.1, -0.2]).double().expand(2, 3, 4)
+    features = numbers(2, 5, 8, 16)
+    got = model.shifts(features, what, window, 4)
+    for n, k in ((0, 0), (1, 2)):
+        torch.testing.assert_close(
+            got[n, k], model.shifts(features[n : n + 1], what[n : n + 1, k : k + 1], window[:1, :1], 4)[0, 0]
+        )
+
+
 def test_windows_get_no_gradient_and_everything_else_does() -> None:
     model = evidence()
     what, window = numbers(1, 2, 6).requires_grad_(), (0.2 + 0.3 * numbers(1, 2, 4)).requires_grad_()
@@ -69,6 +83,12 @@ def test_raw_is_the_inverse_of_logits(masks: ApexNormalisation | ScalorNormalisa
     assert extreme.isfinite().all()
     assert extreme[0] < -7
     assert extreme[1] > 7
+    half = torch.tensor([-8.0, -4.0, 0.5, 4.0, 8.0], dtype=torch.bfloat16, requires_grad=True)
+    again = masks.raw(masks.logits(half))
+    assert again.isfinite().all()
+    again.sum().backward()
+    assert half.grad is not None
+    assert half.grad.isfinite().all()
 
 
 def test_untrained_masks_are_those_of_codes_alone() -> None:
@@ -118,5 +138,36 @@ def test_a_missing_refinement_counts_in_full() -> None:
     torch.nn.init.normal_(model.pixels.query.weight)
     video = small.video(1, 2)
     full = Context({**small.SCHEDULE, **schedule_at({"refinement": 1.0})}, detail=True)
+    none = Context({**small.SCHEDULE, **schedule_at({"refinement": 0.0})}, detail=True)
     with torch.no_grad():
-        torch.testing.assert_close(model(video, small.CONTEXT).masks, model(video, full).masks)
+        missing = model(video, small.CONTEXT).masks
+        torch.testing.assert_close(missing, model(video, full).masks)
+        assert (missing - model(video, none).masks).abs().max() > 1e-3
+
+
+def whole(over: Literal["channel", "pixel"], whole_colours: bool, **values: float) -> tuple[Tensor, Tensor]:
+    """nll and posterior of one model that draws shadows, with a mixture over channels or pixels."""
+    torch.manual_seed(0)
+    background = Background(small.SIZE, 6, 6, shadow=0.7)
+    model = small.tiny(
+        likelihood=MixtureLikelihood(mixture_over=over), whole_colours=whole_colours, background=background
+    )
+    context, video = Context({**small.SCHEDULE, **schedule_at(values)}, detail=True), small.video(1, 2)
+    with torch.no_grad():
+        scene = model.eval()(video, context)
+        return scene.terms["nll"], model.posterior(scene, video, context)
+
+
+def test_whole_colours_go_from_channels_to_pixels_in_loss_and_posterior() -> None:
+    channels, pixels = whole("channel", False), whole("pixel", False)
+    assert (channels[0] - pixels[0]).abs() > 1
+    assert (channels[1] - pixels[1]).abs().max() > 0.01
+    for values, want in (({"refinement": 0.0}, channels), ({"refinement": 1.0}, pixels), ({}, pixels)):
+        for found, wanted in zip(whole("channel", True, **values), want, strict=True):
+            torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_how_much_of_the_shadow_counts_is_scheduled() -> None:
+    nll = [whole("channel", False, shadow=depth)[0] for depth in (0.0, 0.5, 1.0)]
+    assert nll[0] > nll[1] > nll[2]
+    assert torch.equal(nll[2], whole("channel", False)[0])

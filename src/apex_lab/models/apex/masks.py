@@ -177,7 +177,7 @@ class ApexNormalisation(MaskNormalisation):
 
     def raw(self, alpha: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """The inverse of `logits`, within +-7.25."""
-        return torch.atanh((alpha / self.c).clamp(-NEARLY, NEARLY))
+        return torch.atanh((full(alpha) / self.c).clamp(-NEARLY, NEARLY))
 
     def _occupancy(
         self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster
@@ -247,7 +247,7 @@ class ScalorNormalisation(MaskNormalisation):
 
     def raw(self, alpha: Float[Tensor, "..."]) -> Float[Tensor, "..."]:
         """The inverse of `logits`, within +-13.8."""
-        return torch.logit(alpha, eps=1 - NEARLY)
+        return torch.logit(full(alpha), eps=1 - NEARLY)
 
     def _warped(
         self, alpha: Float[Tensor, "... K g g"], presence: Float[Tensor, "... K"], paster: Paster

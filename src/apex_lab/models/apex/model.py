@@ -87,6 +87,7 @@ class Apex(SceneModel):
         "refinement": (0.0, 1.0),
     }
     optional_schedules = ("shadow", "refinement")
+    changeable = ("merges", "piece_price", "hollow_price")
 
     def __init__(
         self,

@@ -58,8 +58,7 @@ class PixelEvidence(nn.Module):
         size: int,
     ) -> Float[Tensor, "N n size size"]:
         """What is added to each object's mask logits before they are squashed; windows get no gradient from it."""
-        side = features.shape[-1]
-        agreement = (self.query(what) @ features.flatten(2)).view(-1, 1, side, side)
+        agreement = (self.query(what) @ features.flatten(2)).view(-1, 1, *features.shape[-2:])
         return crop(agreement, window.detach().reshape(-1, 1, 4), size).view(*what.shape[:2], size, size)
 
     def nothing(self) -> Float[Tensor, ""]:
