@@ -36,7 +36,7 @@ class Pairs(NamedTuple):
     """V pairs of components, each of one of F frames; the first is the larger one.
 
     frame (V,): of which frame. first, second (V,): which of its n components. valid (V,): they touch.
-    rim (V,): pixels along which they meet. place (V, 4): the window around both.
+    rim (V,): pixels along which they meet, and those where they overlap. place (V, 4): the window around both.
     """
 
     frame: Int[Tensor, " V"]
@@ -94,7 +94,10 @@ def around(mask: Float[Tensor, "V H W"]) -> Float[Tensor, "V 4"]:
 
 
 def gap(masks: Masks, pairs: Pairs) -> Float[Tensor, " V"]:
-    """Pixels of background in the convex hull of both, beyond those in the hull of each (see hulls.py)."""
+    """Pixels of background in the convex hull of both, less those in the hull of each by itself (see hulls.py).
+
+    Background in the hulls of both pieces is taken off twice, so the number can be below zero.
+    """
     owner, most = torch.zeros_like(masks.background, dtype=torch.int64), masks.background
     for i, mask in enumerate(masks.objects.unbind(1)):  # an argmax over components takes several times as long
         owner, most = torch.where(mask > most, i + 1, owner), torch.maximum(mask, most)
