@@ -23,7 +23,7 @@ from apex_lab import bench
 from apex_lab.base.errors import UserError
 from apex_lab.benchmark import child, compare
 from apex_lab.benchmark import printed as report
-from apex_lab.benchmark.arithmetic import counted_by_part, shares
+from apex_lab.benchmark.arithmetic import flops_by_part, processor_seconds, shares
 from apex_lab.benchmark.measure import Case, measure
 from apex_lab.benchmark.profile import REST, seconds_by_part
 from apex_lab.benchmark.work import Workload
@@ -427,9 +427,35 @@ def test_flops_are_counted_by_part_and_backward_and_without_a_graph() -> None:
                 linear(torch.rand(4, 6))
         found.sum().backward()
 
-    parts = counted_by_part(step)
-    assert {name: work.flops for name, work in parts.items()} == {"outer": of_rows, "inner": of_image, REST: of_image}
-    assert all(0 <= work.seconds < 1 for work in parts.values())
+    assert flops_by_part(step) == {"outer": of_rows, "inner": of_image, REST: of_image}
+
+
+def test_the_processors_seconds_are_split_by_part_and_nothing_stays_patched() -> None:
+    def busy(seconds: float) -> None:
+        end = time.process_time() + seconds
+        while time.process_time() < end:
+            pass
+
+    def step() -> None:
+        with torch.profiler.record_function("outer"):
+            busy(0.02)
+            with torch.profiler.record_function("inner"):
+                busy(0.04)
+            time.sleep(0.05)  # waiting is no work
+        with torch.profiler.record_function("outer"):
+            busy(0.01)
+
+    ways = torch.profiler.record_function.__enter__, torch.profiler.record_function.__exit__
+    found = processor_seconds(step)
+    assert found.keys() == {"outer", "inner", REST}
+    assert found == {
+        "outer": pytest.approx(0.03, abs=0.01),
+        "inner": pytest.approx(0.04, abs=0.01),
+        REST: pytest.approx(0, abs=0.01),
+    }
+    with pytest.raises(ZeroDivisionError):
+        processor_seconds(lambda: 1 / 0)
+    assert ways == (torch.profiler.record_function.__enter__, torch.profiler.record_function.__exit__)
 
 
 def test_a_matrix_product_runs_at_its_own_rate() -> None:

@@ -167,6 +167,11 @@ def test_whole_colours_go_from_channels_to_pixels_in_loss_and_posterior() -> Non
             torch.testing.assert_close(found, wanted, rtol=1e-4, atol=1e-4)
 
 
+def test_whole_colours_from_the_start_and_later_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"mixture_over=pixel .* set model\.whole_colours=false or"):
+        whole("pixel", True)
+
+
 def test_how_much_of_the_shadow_counts_is_scheduled() -> None:
     nll = [whole("channel", False, shadow=depth)[0] for depth in (0.0, 0.5, 1.0)]
     assert nll[0] > nll[1] > nll[2]

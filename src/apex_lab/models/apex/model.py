@@ -129,6 +129,11 @@ class Apex(SceneModel):
             raise ValueError(
                 f"model.background.image_size={background.image_size} must be that of the model, {image_size}"
             )
+        if whole_colours and isinstance(likelihood, MixtureLikelihood) and likelihood.mixture_over == "pixel":
+            raise ValueError(
+                "model.likelihood.mixture_over=pixel mixes whole colours from the start and model.whole_colours=true "
+                "mixes channels at first: set model.whole_colours=false or model.likelihood.mixture_over=channel"
+            )
         self.image_size, self.hidden, self.max_objects = image_size, hidden, max_objects
         self.input_size = (image_size, image_size)
         self.render_top = min(render_top or grid**2, grid**2)
