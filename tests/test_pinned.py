@@ -1,7 +1,7 @@
 """Recorded numbers: refactorings may not move them.
 
 tests/pinned/numbers.json holds the losses and gradient norms of APEX's first steps at two scales, recorded when P2D got
-its own recipe (cpu) and when what holds nothing was left out on a CPU (smoke), which changed rounding alone, and the
+batches of four (cpu) and when what holds nothing was left out on a CPU (smoke), which changed rounding alone, and the
 scores of the shipped weights on four test videos, recorded when they were shipped.
 tests/pinned/format_1 holds a finished run of commit 3fe8b97.
 """

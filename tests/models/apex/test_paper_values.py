@@ -44,14 +44,28 @@ def test_sigma_fg_at_the_ends_of_a_training(scale: str, first: float, last: floa
 def test_the_recipe_of_p2d_shrinks_windows_once_objects_are_there_and_refines_later() -> None:
     config = resolved("model=apex", "data=p2d", "scale=cpu")
     loose = components.build(config["loss"]["loose_windows"], "loss.loose_windows")
-    assert [loose(step) for step in (0, 500, 1_000, 1_500, 10_000)] == [0.0, 0.0, 100.0, 200.0, 200.0]
+    assert [loose(step) for step in (0, 275, 550, 825, 5_500)] == [0.0, 0.0, 100.0, 200.0, 200.0]
     assert config["loss"]["kl_pres"] == 8.0
     shadow = components.build(config["schedule"]["shadow"], "schedule.shadow")
-    assert [shadow(step) for step in (0, 3_000, 3_250, 3_500, 10_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    assert [shadow(step) for step in (0, 1_650, 1_925, 5_500)] == [0.0, 0.0, 1.0, 1.0]
     refinement = components.build(config["schedule"]["refinement"], "schedule.refinement")
-    assert [refinement(step) for step in (0, 9_000, 9_250, 9_500, 10_000)] == [0.0, 0.0, 0.5, 1.0, 1.0]
+    assert [refinement(step) for step in (0, 4_950, 5_225, 5_500)] == [0.0, 0.0, 1.0, 1.0]
     rate = components.build(config["lr_scale"], "lr_scale")
-    assert (rate(3_000), rate(config["trainer"]["max_steps"])) == (1.0, pytest.approx(0.05))
+    assert (rate(1_650), rate(config["trainer"]["max_steps"])) == (1.0, pytest.approx(0.05))
+
+
+def test_the_recipe_of_p2d_is_that_of_scale_cpu_in_batches_of_four() -> None:
+    p2d, others = (resolved("model=apex", f"data={data}", "scale=cpu") for data in ("p2d", "sprites"))
+    assert (p2d["clips"]["batch_size"], others["clips"]["batch_size"]) == (4, 2)
+    for group, name in [
+        *(("schedule", name) for name in ("temperature", "discovery_presence", "carry", "sigma_fg_scale")),
+        ("schedule", "sigma_bg_scale"),
+        ("loss", "kl_what"),
+    ]:
+        ours, theirs = p2d[group][name], others[group][name]
+        assert {key: round(0.55 * theirs[key]) for key in ("delay", "steps") if theirs.get(key)} == {
+            key: ours[key] for key in ("delay", "steps") if ours.get(key)
+        }
 
 
 @pytest.mark.parametrize(
