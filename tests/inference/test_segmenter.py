@@ -50,7 +50,8 @@ def test_chunks_give_what_the_whole_video_gives(apex: apex_lab.Segmenter, pushin
         assert [part.masks.shape[1] for part in parts] == [min(chunk, 24 - start) for start in range(0, 24, chunk)]
         assert torch.equal(torch.cat([part.ids for part in parts], dim=1), whole.ids)
         masks = torch.cat([part.masks for part in parts], dim=1)
-        assert (masks - whole.masks).abs().max() < 1e-4
+        # Rounding of float32, which grows from frame to frame: 4e-4 at most was seen, in float64 1e-12
+        assert (masks - whole.masks).abs().max() < 2e-3
 
 
 def test_a_stored_state_continues_the_video(apex: apex_lab.Segmenter, pushing: np.ndarray) -> None:

@@ -45,8 +45,8 @@ class Counted(TorchDispatchMode):
                 found = func.decompose(*args, **kwargs)
         if found is NotImplemented:
             found = func(*args, **kwargs)
-        flops = flop_registry.get(func._overloadpacket)
-        self.flops[self._inside[-1]] += flops(*args, **kwargs, out_val=found) if flops else 0
+        if (flops := flop_registry.get(func._overloadpacket)) is not None:
+            self.flops[self._inside[-1]] += flops(*args, **kwargs, out_val=found)
         return found
 
 
@@ -63,7 +63,11 @@ def flops_by_part(step: Callable[[], object]) -> dict[str, int]:
 
 
 def processor_seconds(step: Callable[[], object]) -> dict[str, float]:
-    """Runs one step; seconds of all of the processor's threads together by part, inner parts by themselves."""
+    """Runs one step; seconds of all of the processor's threads together by part, inner parts by themselves.
+
+    The profiler's seconds are those of a clock, and it lengthens what it times. So enter and exit of `record_function`
+    are replaced while the step runs, for the whole process: one thread, eager code.
+    """
     seconds: dict[str, float] = {}
     inside, since = [REST], time.process_time()
     enter, leave = record_function.__enter__, record_function.__exit__
@@ -113,16 +117,18 @@ def matrix_rate(device: torch.device, repeats: int = 5) -> float:
 def shares(step: Callable[[], object], device: torch.device, seconds: Mapping[str, float]) -> dict[str, Any]:
     """FLOPs of each part of a step, and which share of `matrix_rate` the part runs at.
 
+    They are counted in one step and timed in the next: where a model leaves out work by draws, shares are approximate.
+
     Args:
         step: with parts marked by `record_function`.
         seconds: of the parts, for a GPU; on a CPU the processor's time is taken here, which waiting for other programs
             does not lengthen.
     """
     rate = matrix_rate(device)
-    flops = flops_by_part(step)
-    if device.type == "cpu":
-        seconds = processor_seconds(step)
-    taken = {name: seconds.get(name, 0.0) for name in flops}
+    counted = flops_by_part(step)
+    taken = processor_seconds(step) if device.type == "cpu" else dict(seconds)
+    flops = {name: counted.get(name, 0) for name in {**taken, **counted}}
+    taken = {name: taken.get(name, 0.0) for name in flops}
     return {
         "matrix_rate": rate,
         "flops": flops,

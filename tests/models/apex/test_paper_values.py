@@ -47,9 +47,9 @@ def test_the_recipe_of_p2d_shrinks_windows_once_objects_are_there_and_refines_la
     assert [loose(step) for step in (0, 275, 550, 825, 5_500)] == [0.0, 0.0, 100.0, 200.0, 200.0]
     assert config["loss"]["kl_pres"] == 8.0
     shadow = components.build(config["schedule"]["shadow"], "schedule.shadow")
-    assert [shadow(step) for step in (0, 1_650, 1_925, 5_500)] == [0.0, 0.0, 1.0, 1.0]
+    assert [shadow(step) for step in (0, 1_650, 1_705, 1_925, 5_500)] == pytest.approx([0, 0, 0.2, 1, 1])
     refinement = components.build(config["schedule"]["refinement"], "schedule.refinement")
-    assert [refinement(step) for step in (0, 4_950, 5_225, 5_500)] == [0.0, 0.0, 1.0, 1.0]
+    assert [refinement(step) for step in (0, 4_950, 5_005, 5_225, 5_500)] == pytest.approx([0, 0, 0.2, 1, 1])
     rate = components.build(config["lr_scale"], "lr_scale")
     assert (rate(1_650), rate(config["trainer"]["max_steps"])) == (1.0, pytest.approx(0.05))
 

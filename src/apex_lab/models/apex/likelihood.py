@@ -198,7 +198,7 @@ class MixtureLikelihood(Likelihood):
             means: their images, RGB in [0, 1].
             background: which components have the background's standard deviation.
             scale_fg, scale_bg, whole: as in `__call__`.
-            shadowed: what pixels of each component are as likely like as `means`; None: `means` alone.
+            shadowed: a second image of each component, in shadow, say; at each pixel as likely as `means`; None: none.
         """
         sigma_fg, sigma_bg = self._sigmas(image, scale_fg, scale_bg)
         sigma = torch.where(background, sigma_bg, sigma_fg)[:, None, None, None]
