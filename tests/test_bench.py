@@ -235,7 +235,7 @@ def test_writes_a_file_with_every_row(
     assert compared["models"]["model"]["model_trains_times_as_many"] == 1
     assert set(compared["models"]) == {"model", "straightforward", "straightforward, renders as many"}
     assert all(each["model_trains_times_as_many"] > 0 for each in compared["models"].values())
-    assert told["versions"]["torch"] == torch.__version__
+    assert told["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]  # some builds tell CUDA in one alone
     assert told["hardware"]["threads"] == 1
     assert "peak memory" in ended.out
     assert "times as many frames/s" in ended.out
