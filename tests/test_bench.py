@@ -235,7 +235,8 @@ def test_writes_a_file_with_every_row(
     assert compared["models"]["model"]["model_trains_times_as_many"] == 1
     assert set(compared["models"]) == {"model", "straightforward", "straightforward, renders as many"}
     assert all(each["model_trains_times_as_many"] > 0 for each in compared["models"].values())
-    assert told["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]  # some builds tell CUDA in one alone
+    # Some builds have +cu130 in one of the two alone
+    assert told["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
     assert told["hardware"]["threads"] == 1
     assert "peak memory" in ended.out
     assert "times as many frames/s" in ended.out
