@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from apex_lab.base.memory import keep_freed_memory
 from apex_lab.config.building import build_clip_frames, build_lr_scale, build_optimizer, build_schedules, build_weights
 from apex_lab.config.schema import Config
 from apex_lab.data import VideoSource, training_loader, whole_loader
+from apex_lab.data.loaders import Loader
+from apex_lab.data.resident import Resident
 from apex_lab.scene import SceneModel
 from apex_lab.training.callbacks import LastValidation, Lockstep, not_restored
 from apex_lab.training.learner import Learner
@@ -62,16 +65,6 @@ def fit(
         Interrupted: a process of this training was asked to stop; the step is stored.
     """
     settings = config.trainer
-
-    def optimizer(parameters: list[tuple[str, torch.nn.Parameter]]) -> torch.optim.Optimizer:
-        built = build_optimizer(config, parameters)
-        if training is not None:
-            try:
-                built.load_state_dict(training["optimizer"])
-            except Exception as error:
-                raise UserError(not_restored("the state of the optimizer", error)) from error
-        return built
-
     keep_freed_memory()
     update = WeightUpdate(
         model,
@@ -84,6 +77,7 @@ def fit(
         step,
         mode_of(config, device),
     )
+    optimizer = partial(_optimizer, config, training)
     learner = Learner(update, optimizer, settings.log_interval, ranks.rank, ranks.world, folder)
     every = [
         LastValidation(settings.max_steps),
@@ -93,19 +87,7 @@ def fit(
     ]
     trainer = _trainer(config, update, device, ranks, every, loggers, folder)
     resume_at(trainer, step)
-    batches = training_loader(
-        source,
-        config.clips.batch_size,
-        config.seed,
-        step,
-        settings.max_steps,
-        build_clip_frames(config),
-        ranks.rank,
-        ranks.world,
-        config.clips.starts,
-        trainer.strategy.root_device,
-        config.clips.on_device,
-    )
+    batches = _batches(config, source, step, ranks, trainer.strategy.root_device)
     validation = whole_loader(
         source.sets["val"],
         config.evaluation.batch_size,
@@ -119,6 +101,36 @@ def fit(
     if learner.stop:
         raise Interrupted(learner.stop)
     return learner.step >= settings.max_steps or trainer.should_stop
+
+
+def _optimizer(
+    config: Config, training: Mapping[str, Any] | None, parameters: list[tuple[str, torch.nn.Parameter]]
+) -> torch.optim.Optimizer:
+    """The optimiser of these parameters, in the state of the checkpoint that `training` comes from."""
+    built = build_optimizer(config, parameters)
+    if training is not None:
+        try:
+            built.load_state_dict(training["optimizer"])
+        except Exception as error:
+            raise UserError(not_restored("the state of the optimizer", error)) from error
+    return built
+
+
+def _batches(config: Config, source: VideoSource, step: int, ranks: Ranks, device: torch.device) -> Loader | Resident:
+    """This rank's batches of training videos from a step on."""
+    return training_loader(
+        source,
+        config.clips.batch_size,
+        config.seed,
+        step,
+        config.trainer.max_steps,
+        build_clip_frames(config),
+        ranks.rank,
+        ranks.world,
+        config.clips.starts,
+        device,
+        config.clips.on_device,
+    )
 
 
 def _trainer(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -42,34 +42,25 @@ def roll_out(
     masks of both, is left to `Apex._explain`.
     """
     state, valid, ids, next_id, carried_on = memory
-    followed = False
     steps: list[Step] = []
-    followed_masks: list[FollowedMasks | None] = []
+    masks: list[FollowedMasks | None] = []
     for t, (frame, claimed) in enumerate(zip(frames, claims, strict=True)):
-        there = any_of(valid)
-        if there or (t == len(frames) - 1 and not followed):  # once at least, so that all weights have gradients
-            followed = True
+        there, followed = any_of(valid), None
+        # in the last frame if in none before, so that all weights have gradients
+        if there or (t == len(frames) - 1 and not any(masks)):
             with record_function("propagation"):
-                slots = filled(valid)
-                few, posterior = _propagated(model, state, valid, slots, frame, schedule, noise)
-                before = few
-                if slots is not None:
-                    before, posterior = spread(few, posterior, slots, valid)
-                few_alpha = None if claimed is None else model.alpha(few.what)
-                followed_masks.append(FollowedMasks(few.what, few_alpha, slots))
-        else:
+                followed = _followed(model, state, valid, frame, schedule, noise, masks_now=claimed is not None)
+        if followed is None:
             before, posterior = model.propagation.nothing(state, noise)
-            followed_masks.append(None)
+        else:
+            before, posterior = followed.objects, followed.posterior
+        masks.append(None if followed is None else followed.masks)
 
         open_ = may_discover(carried_on, schedule, noise).to(frame.prob.dtype)
         context = unexplained = torch.ones_like(frame.prob)  # where nothing is propagated, everything is open
-        if there and claimed is not None:
-            assert few_alpha is not None
+        if there and followed is not None and claimed is not None:
             with record_function("discovery"):
-                paster = model.paster(few.place, few_alpha.shape[-1])
-                scope = claimed.of_videos(1 - model.masks.foreground(few_alpha, few.presence, paster))
-                context = claimed.put(context, context_probability(scope, claimed.masks))
-                unexplained = claimed.put(unexplained, scope_in_windows(scope, claimed.rows, claimed.columns))
+                context, unexplained = _left_by(model, followed, claimed, context)
         prob = frame.prob * context * open_  # Eq. 17
         # Eq. 6: the prior of a discovery's presence, given the propagated objects
         prior = schedule["discovery_presence"] * unexplained * open_
@@ -83,29 +74,62 @@ def roll_out(
         kept = carry(candidates.presence, exists, ids, next_id, model.keep_threshold)
         steps.append(
             Step(
-                candidates.what,
-                candidates.place,
-                gather_slots(frame.alpha, top),
-                candidates.presence,
-                exists & (candidates.presence > 0),
-                valid,
-                posterior,
-                prob,
-                prior,
-                pres,
-                kept.source,
-                kept.valid,
-                kept.ids,
+                what=candidates.what,
+                place=candidates.place,
+                alpha=gather_slots(frame.alpha, top),
+                presence=candidates.presence,
+                valid=exists & (candidates.presence > 0),
+                alive=valid,
+                propagated=posterior,
+                discovery_prob=prob,
+                discovery_prior=prior,
+                discovery_pres=pres,
+                source=kept.source,
+                carried=kept.valid,
+                ids=kept.ids,
             )
         )
         state, ids, next_id = before.unpacked(gather_slots(both, kept.source)), kept.ids, kept.next_id
         carried_on = carries_on(carried_on, schedule, noise)
         valid = kept.valid & carried_on
-    video = stack_steps(steps)
-    assert isinstance(video.propagated, Posterior)
-    beliefs = model.propagation.beliefs(video.propagated)
-    alpha = torch.cat([_followed(model, followed_masks, video.alpha, valid.shape[1]), video.alpha], dim=2)
-    return video._replace(propagated=beliefs, alpha=alpha), Memory(state, valid, ids, next_id, carried_on)
+    return _video(model, steps, masks), Memory(state, valid, ids, next_id, carried_on)
+
+
+class _Followed(NamedTuple):
+    """Objects that were propagated into a frame.
+
+    objects, posterior: of all P slots. few: the objects of those that hold one, which `masks` are of.
+    """
+
+    objects: Objects
+    posterior: Posterior
+    few: Objects
+    masks: FollowedMasks
+
+
+def _followed(
+    model: Apex, state: Objects, valid: Tensor, frame: Frame, schedule: Schedule, noise: Noise | None, masks_now: bool
+) -> _Followed:
+    """The objects of a frame in the next one; their mask logits at once or later, with those of other frames."""
+    slots = filled(valid)
+    few, posterior = _propagated(model, state, valid, slots, frame, schedule, noise)
+    objects = few
+    if slots is not None:
+        objects, posterior = spread(few, posterior, slots, valid)
+    masks = FollowedMasks(few.what, model.alpha(few.what) if masks_now else None, slots)
+    return _Followed(objects, posterior, few, masks)
+
+
+def _left_by(
+    model: Apex, followed: _Followed, claimed: Claims, everything: Float[Tensor, "B D"]
+) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B D"]]:
+    """What propagated objects leave to discovery's cells, of `everything`: of their masks and of their windows."""
+    few, alpha = followed.few, followed.masks.alpha
+    assert alpha is not None
+    paster = model.paster(few.place, alpha.shape[-1])
+    scope = claimed.of_videos(1 - model.masks.foreground(alpha, few.presence, paster))
+    context = claimed.put(everything, context_probability(scope, claimed.masks))
+    return context, claimed.put(everything, scope_in_windows(scope, claimed.rows, claimed.columns))
 
 
 def _propagated(
@@ -134,7 +158,16 @@ def _propagated(
     )
 
 
-def _followed(
+def _video(model: Apex, steps: list[Step], masks: list[FollowedMasks | None]) -> Step:
+    """Frames -> video, with what needs no frame before: priors of propagated objects and their mask logits."""
+    video = stack_steps(steps)
+    assert isinstance(video.propagated, Posterior)
+    beliefs = model.propagation.beliefs(video.propagated)
+    alpha = torch.cat([_alphas(model, masks, video.alpha, video.alive.shape[-1]), video.alpha], dim=2)
+    return video._replace(propagated=beliefs, alpha=alpha)
+
+
+def _alphas(
     model: Apex, frames: list[FollowedMasks | None], like: Float[Tensor, "B T N g g"], total: int
 ) -> Float[Tensor, "B T P g g"]:
     """Mask logits of all slots in all frames; those that the loop could do without are made here, at once."""

@@ -338,36 +338,21 @@ class Apex(SceneModel):
         """Rendering, likelihood, KL and the result; no frame waits for another, so a GPU does all at once."""
         b, t = video.shape[:2]
         images, source = video.flatten(0, 1), steps.source.flatten(0, 1)
-        drawn = [x.flatten(0, 1) for x in (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)]
-        parts = parts_of(drawn[2], 3 * self.image_size**2, video)
-        seen = [Drawn(*map(part.of_components, drawn)) for part in parts]
+        everything = [x.flatten(0, 1) for x in (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)]
+        parts = parts_of(everything[2], 3 * self.image_size**2, video)
+        seen = [Drawn(*map(part.of_components, everything)) for part in parts]
         pasters = [self.paster(part.place, part.alpha.shape[-1]) for part in seen]
         masks = [
-            self.masks.compose(
-                self.sharpened(
-                    part.alpha,
-                    part.what,
-                    part.place,
-                    None if evidence is None else which.of_frames(evidence),
-                    context.schedule,
-                ),
-                part.presence,
-                part.valid,
-                paster,
-            )
-            for which, part, paster in zip(parts, seen, pasters, strict=True)
+            self._masks(drawn, paster, None if evidence is None else part.of_frames(evidence), context.schedule)
+            for part, drawn, paster in zip(parts, seen, pasters, strict=True)
         ]
-
-        q_background = self.background.posterior(in_order(parts, [m.background for m in masks]), images)
-        z_background = q_background.sample(noise)
+        z_background, kl_background = self._background(
+            in_order(parts, [m.background for m in masks]), images, (b, t), context, noise
+        )
         backdrop = self.background.decode(z_background)
-        over_time = z_background.unflatten(0, (b, t))
-        p_background = self.background.prior(over_time, None if context.state is None else context.state.z_background)
-        kl_background = kl_gaussian(type(q_background)(*(x.unflatten(0, (b, t)) for x in q_background)), p_background)
-
         pictures = [
-            self._picture(part, images, source, visible, paster, found, backdrop, context)
-            for part, visible, paster, found in zip(parts, seen, pasters, masks, strict=True)
+            self._picture(part, images, source, drawn, paster, found, backdrop, context)
+            for part, drawn, paster, found in zip(parts, seen, pasters, masks, strict=True)
         ]
         picture = video_of(parts, pictures, b)
         assert isinstance(steps.propagated, Beliefs)
@@ -391,7 +376,28 @@ class Apex(SceneModel):
             "loose_windows": picture.loose_windows.sum(1),
         }
         terms = {name: term for name, term in terms.items() if name not in context.unused}
-        return scene_of(steps, picture, terms, context.detail, state_with(over_time[:, -1]))
+        last = z_background.unflatten(0, (b, t))[:, -1]
+        return scene_of(steps, picture, terms, context.detail, state_with(last))
+
+    def _masks(self, drawn: Drawn, paster: Paster, evidence: Tensor | None, schedule: Schedule) -> Masks:
+        """Masks of a part's N frames."""
+        alpha = self.sharpened(drawn.alpha, drawn.what, drawn.place, evidence, schedule)
+        return self.masks.compose(alpha, drawn.presence, drawn.valid, paster)
+
+    def _background(
+        self,
+        mask: Float[Tensor, "F H W"],
+        images: Float[Tensor, "F 3 H W"],
+        shape: tuple[int, int],
+        context: Context,
+        noise: Noise | None,
+    ) -> tuple[Float[Tensor, "F Z"], Float[Tensor, "B T"]]:
+        """The background's code of all frames, shape = (B, T), and its KL in nats."""
+        posterior = self.background.posterior(mask, images)
+        code = posterior.sample(noise)
+        before = None if context.state is None else context.state.z_background
+        prior = self.background.prior(code.unflatten(0, shape), before)
+        return code, kl_gaussian(type(posterior)(*(x.unflatten(0, shape) for x in posterior)), prior)
 
     def _picture(
         self,
