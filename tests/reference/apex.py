@@ -6,6 +6,7 @@ The same parts, weights, equations and loss terms, and as wide. What differs is 
   result;
 - every crop and paste is an `affine_grid` and a `grid_sample` with a picture of its own for every component;
 - the mixture likelihood is a `logsumexp`, and it and p_context are differentiated by autograd;
+- masks that see pixels, and pieces that become one, are calculated anew (apex_merging.py);
 - `render_top=None` renders all cells of discovery, as the published equations do; a number renders as many as APEX.
 """
 
@@ -25,10 +26,16 @@ from apex_lab.inference.predictor import joined
 from apex_lab.models.apex.likelihood import MixtureLikelihood, log_normal
 from apex_lab.models.apex.loop import carries_on, may_discover, rendered
 from apex_lab.models.apex.masks import ApexNormalisation, Masks
-from apex_lab.models.apex.merging import merged
 from apex_lab.models.apex.model import Apex
 from apex_lab.models.apex.objective import kl_terms
-from apex_lab.models.apex.objects import Objects, Proposals, context_probability, sample_presence, scope_in_windows
+from apex_lab.models.apex.objects import (
+    Beliefs,
+    Objects,
+    Proposals,
+    context_probability,
+    sample_presence,
+    scope_in_windows,
+)
 from apex_lab.models.apex.parts import Part
 from apex_lab.models.apex.result import Drawn, scene_of, video_of
 from apex_lab.models.apex.rollout import Memory, Step, frames_of, stack_steps
@@ -37,6 +44,7 @@ from apex_lab.models.apex.windows import window_of
 from apex_lab.nn.distributions import Gaussian, kl_gaussian
 from apex_lab.nn.spatial_transformer import Paster
 from apex_lab.scene import Context, Noise, Scene, Schedule
+from tests.reference.apex_merging import merged, pixel_features, sharpened
 from tests.reference.grid import GridPaster, grid_crop
 
 
@@ -115,12 +123,12 @@ class Straightforward(Apex):
         noise = context.noise if self.training else None
         look_at, follow_in, features = self._sources(video, i, memory)
         found = self.discovery(features[:, 0], look_at, self.glimpses, self.appearance, noise)
+        pixels = pixel_features(self, video[:, i], context.schedule)
         for _ in range(self.merges):
-            evidence = self._evidence(video[:, i], context.schedule)
-            found = merged(self, found, video[:, i], look_at, context.schedule, evidence)
+            found = merged(self, found, video[:, i], look_at, pixels, context.schedule)
         proposals = found.over_time((len(video), 1), None)
         step = self._infer(look_at, follow_in, proposals, memory, context.schedule, noise)
-        return self._render(video[:, i : i + 1], proposals, step, memory, context, noise)
+        return self._render(video[:, i : i + 1], pixels, proposals, step, memory, context, noise)
 
     def _sources(self, video: Tensor, i: int, memory: _Memory) -> tuple[Tensor, Tensor, Tensor]:
         """What is looked at in this frame and what is followed, (B, C, h, w), and its features (B, 1, F, h, w)."""
@@ -199,6 +207,7 @@ class Straightforward(Apex):
     def _render(
         self,
         frame: Float[Tensor, "B 1 3 H W"],
+        pixels: Float[Tensor, "B E H W"] | None,
         proposals: Proposals,
         step: Step,
         memory: _Memory,
@@ -211,13 +220,13 @@ class Straightforward(Apex):
             x[:, 0] for x in (steps.alpha, steps.presence, steps.valid, steps.place, steps.what)
         )
         paster = self.paster(place, alpha.shape[-1])
-        evidence = self._evidence(frame[:, 0], context.schedule)
-        sharp = self.sharpened(alpha, what, place, evidence, context.schedule)
+        sharp = sharpened(self, alpha, what, place, pixels, context.schedule)
         masks = self.masks.compose(sharp, presence, valid, paster)
         backdrop, kl_background = self._backdrop(frame[:, 0], masks, memory, noise)
         seen = Drawn(alpha, presence, valid, place, what)
         picture = self._picture(Part(), frame[:, 0], step.source, seen, paster, masks, backdrop, context)
         slots = self.max_objects
+        assert isinstance(steps.propagated, Beliefs)
         terms = {
             "nll": -picture.log_likelihood,
             **kl_terms(
