@@ -50,6 +50,7 @@ REFUSED = {
     "loss.error=x": "loss.error = 'x' is wrong",
     "loss.error={a:1}": "loss.error = {'a': 1} is wrong: give a number or a schedule with a _target_.",
     "~schedule.noise": "schedule.noise is missing: the model needs noise.",
+    "schedule.noise=2": "schedule.noise = 2 is wrong: a schedule has keys: set those, or give another one with a",
     "schedule.noise.steps=-1": "schedule.noise.steps = -1 is wrong: input should be greater than or equal to 0.",
     "data.frames=0": "data.frames = 0 is wrong: input should be greater than or equal to 1.",
     "data.frames=???": "data.frames is missing: write data.frames=...",

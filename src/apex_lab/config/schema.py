@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from apex_lab.base.validation import PathText
 from apex_lab.config import initial
@@ -79,6 +79,12 @@ class InitialPart(_Part):
     weights: str = Field(pattern=f"^{initial.DIGEST}$")
 
 
+def _node(value: Any) -> Any:
+    if not isinstance(value, dict):
+        raise ValueError("a schedule has keys: set those, or give another one with a _target_")
+    return value
+
+
 class Config(_Part):
     """The root of what `python -m apex_lab.train` composes; components are checked by `apex_lab.config.components`."""
 
@@ -86,7 +92,7 @@ class Config(_Part):
     init_from: InitialPart | None = None
     model: dict[str, Any]
     optimizer: dict[str, Any] | None
-    schedule: dict[str, dict[str, Any]]
+    schedule: dict[str, Annotated[dict[str, Any], BeforeValidator(_node)]]
     loss: dict[str, float | dict[str, Any]]
     lr_scale: float | dict[str, Any]
     data: dict[str, Any]
