@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from apex_lab import bench
 from apex_lab.base.errors import UserError
-from apex_lab.benchmark import child, compare
+from apex_lab.benchmark import arithmetic, child, compare
 from apex_lab.benchmark import printed as report
 from apex_lab.benchmark.arithmetic import flops_by_part, processor_seconds, shares
 from apex_lab.benchmark.measure import Case, measure
@@ -281,6 +282,11 @@ REFUSED = {
     "bench.modes=[compiled cuda graph]": "bench.modes holds 'compiled cuda graph', but nothing is measured on a GPU: "
     "leave it out.",
     "bench=3": "bench = 3 is wrong: give bench.repeats=... and the like.",
+    "bench.output=/dev/null": "bench.output = '/dev/null' is a device or the like: name a file.",
+    "bench.output=/proc/foo": "/proc/foo cannot be written (No such file or directory): choose another folder or its "
+    "permissions.",
+    "bench.output=/dev/null/foo/bar": "/dev/null/foo/bar cannot be written (Not a directory): choose another folder or",
+    "paths.outputs=/proc/foo": "_seed_0.json cannot be written (No such file or directory): choose another folder or",
     "bench.output=.": "bench.output = '.' is a folder: name a file.",
     "model=oracle": "model=oracle reads the ground truth: choose a model that looks at the video.",
     "trainer.max_step=3": "Unknown key trainer.max_step = 3; did you mean 'trainer.max_steps'?",
@@ -464,3 +470,81 @@ def test_a_matrix_product_runs_at_its_own_rate() -> None:
     found = shares(lambda: square @ square, HERE, {})
     assert found["flops"] == {REST: 2 * 1024**3}
     assert 0.3 < found["share"] < 1.5
+
+
+def test_the_step_that_is_counted_is_the_step_that_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a workload that does more at every step, and by APEX, which discovers in frames that it draws."""
+
+    class Growing:
+        made = 0
+
+        @contextlib.contextmanager
+        def rewound(self) -> Iterator[None]:
+            before = self.made
+            yield
+            self.made = before
+
+        def step(self) -> None:
+            self.made += 1
+            with torch.profiler.record_function("growing"):
+                for _ in range(self.made):
+                    torch.ones(4, 4) @ torch.ones(4, 4)
+
+    timed: list[int] = []
+
+    def counted_again(step: Callable[[], object]) -> dict[str, float]:
+        flops = flops_by_part(step)
+        timed.append(sum(flops.values()))
+        return {name: work / 1e9 for name, work in flops.items()}
+
+    monkeypatch.setattr(arithmetic, "processor_seconds", counted_again)
+    growing, work = (
+        Growing(),
+        workload("+schedule.discover={_target_: apex_lab.training.schedules.Constant, value: 0.5}"),
+    )
+    apex = work.step(training=True)
+    for rewound, step in ((growing.rewound, growing.step), *[(work.rewound, apex)] * 4):
+        found = shares(step, HERE, {}, rewound)
+        assert sum(found["flops"].values()) == timed[-1]
+        assert all(rate == pytest.approx(1e9) for name, rate in found["rates"].items() if found["flops"][name])
+    assert growing.made == 1
+    assert len(set(timed[1:])) > 1  # other steps discover in other frames
+
+
+def test_a_step_taken_back_leaves_number_and_weights() -> None:
+    work = workload()
+    number, before = work.update.step, [p.detach().clone() for p in work.model.parameters()]
+    with work.rewound():
+        work.train()
+        assert work.update.step == number + 1
+        assert any(not torch.equal(a, b) for a, b in zip(before, work.model.parameters(), strict=True))
+    assert work.update.step == number
+    assert all(torch.equal(a, b) for a, b in zip(before, work.model.parameters(), strict=True))
+
+
+def test_a_line_of_the_table_can_be_recomputed() -> None:
+    row = measure(Case(compose_job(*APEX).config, "cpu", "eager", True, 1, 2, 1, 1))
+    *_, table = report.tables([row])
+    _, *lines, rate = table.splitlines()
+    [of_product] = re.findall(r"[\d.]+$", rate)
+    assert {re.split(" {2,}", line)[0] for line in lines} == {*row["arithmetic"]["flops"], "all"}
+    for line in lines:
+        found = re.search(r"(\S+) / (\S+) = (\S+), (\S+)%$", line)
+        assert found is not None, line
+        work, seconds, reached, share = map(float, found.groups())
+        assert work / seconds == pytest.approx(reached, rel=2e-3)
+        assert share / 100 * float(of_product) == pytest.approx(reached, abs=0.0006 * float(of_product))
+
+
+QUIET = """
+import time
+import torch
+from apex_lab.benchmark.profile import seconds_by_part
+seconds_by_part(lambda: time.sleep(0), torch.device("cpu"))
+"""
+
+
+@pytest.mark.slow
+def test_the_profiler_tells_nothing_of_itself(tmp_path: Path) -> None:
+    process = subprocess.run([sys.executable, "-c", QUIET], capture_output=True, text=True, cwd=tmp_path)
+    assert (process.returncode, process.stdout, process.stderr) == (0, "", "")

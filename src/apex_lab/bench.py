@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import make_folder, write_json
+from apex_lab.base.files import draft_of, make_folder, unwritable, write_json
 from apex_lab.base.validation import PathText, shown, validate
 from apex_lab.benchmark import printed as report
 from apex_lab.benchmark.child import in_child
@@ -108,6 +108,8 @@ def check_bench(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequ
             raise UserError(f"data.{name} is missing, and the size of the videos that are measured: give it a value.")
     if asked.output is not None and Path(asked.output).is_dir():
         raise UserError(f"bench.output = {shown(asked.output)} is a folder: name a file.")
+    if asked.output is not None and Path(asked.output).exists() and not Path(asked.output).is_file():
+        raise UserError(f"bench.output = {shown(asked.output)} is a device or the like: name a file.")
     modes = _modes(asked, job)
     named = next((mode for mode in modes if mode in CAPTURED and asked.modes is not None), None)
     if not model.capturable:
@@ -116,7 +118,26 @@ def check_bench(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequ
         modes = tuple(mode for mode in modes if mode not in CAPTURED)
     if named is not None and device_of(job.config.trainer.accelerator).type == "cpu":
         raise UserError(f"bench.modes holds '{named}', but nothing is measured on a GPU: leave it out.")
-    return Bench(job, asked, modes)
+    checked = Bench(job, asked, modes)
+    _check_output(checked.output)
+    return checked
+
+
+def _check_output(path: Path) -> None:
+    """Refuses, before minutes of measuring, a file that could not be written after them.
+
+    A file is made and removed in the folder, or in the nearest one that is there already: permissions alone do not tell
+    (root may write to /proc, and cannot).
+
+    Raises:
+        UserError: no file can be made there.
+    """
+    try:
+        draft = draft_of(next(folder for folder in path.absolute().parents if folder.exists()) / path.name)
+        draft.touch()
+        draft.unlink()
+    except OSError as error:
+        raise unwritable(path, error) from error
 
 
 def _modes(asked: BenchPart, job: Job) -> tuple[Mode, ...]:

@@ -336,7 +336,7 @@ def test_what_no_weight_depends_on_can_be_changed(make_run: Make, ask: Ask, monk
     run = make_run()
     ended = ask(f"checkpoint={run}", "model.width=3")
     assert ended.code == 2
-    assert "model.width = 3 would not fit the trained weights: nothing of this model can be given here." in ended.err
+    assert "model.width = 3 cannot be changed for trained weights: nothing of this model can." in ended.err
     built: list[int] = []
     start = Layers.__init__
 
@@ -347,7 +347,7 @@ def test_what_no_weight_depends_on_can_be_changed(make_run: Make, ask: Ask, monk
     monkeypatch.setattr(Layers, "__init__", watched)
     monkeypatch.setattr(Layers, "changeable", ("extra",))
     ended = ask(f"checkpoint={run}", "model.width=3")
-    assert "model.width = 3 would not fit the trained weights: only extra can be given here." in ended.err
+    assert "model.width = 3 cannot be changed for trained weights: only extra can." in ended.err
     assert ask(f"checkpoint={run}", "model.extra=many").code == 2
     built.clear()
     assert ask(f"checkpoint={run}", "pictures=0", "model.extra=5").code == 0

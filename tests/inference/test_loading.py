@@ -8,10 +8,13 @@ import pytest
 import torch
 
 from apex_lab.base.errors import UserError
+from apex_lab.config.shipped import weights
 from apex_lab.inference.loading import trained_model
+from apex_lab.models.apex import Apex
 from apex_lab.models.op3 import Op3
 from apex_lab.models.slot_attention import SlotAttention
-from apex_lab.scene import Context
+from apex_lab.runs import checkpoints
+from apex_lab.scene import Context, schedule_at
 
 
 def inference(model: torch.nn.Module, **arguments: Any) -> dict[str, Any]:
@@ -40,11 +43,36 @@ def test_slots_and_refinements_of_op3() -> None:
     assert (model.slots, model.plan.first, model.plan.later) == (8, 5, 1)
 
 
+def blocks_seen(**changes: Any) -> torch.Tensor:
+    """Labels (T, H, W) that the shipped weights give to nine grey blocks on the background that they remember."""
+    model = trained_model(checkpoints.load(weights("apex-p2d-cpu"))["inference"], changes).eval()
+    assert isinstance(model, Apex)
+    assert model.background.bias_image is not None
+    for name, value in changes.items():
+        assert getattr(model, name) == value
+    video = torch.sigmoid(model.background.bias_image.detach())[None, None].repeat(1, 3, 1, 1, 1)
+    for y in (6, 26, 46):
+        for x in (6, 26, 46):
+            video[..., y : y + 8, x : x + 8] = 0.95
+    with torch.no_grad():
+        return model(video, Context(schedule_at(dict.fromkeys(model.schedule_ranges, 1.0)))).segmentation()[0]
+
+
+def test_slots_of_apex() -> None:
+    """Fewer slots than objects keep as many apart as there are; more than objects change nothing."""
+    usual = blocks_seen()
+    assert len(usual[0].unique()) > 3
+    assert len(blocks_seen(max_objects=2)[0].unique()) == 3  # and the background
+    assert len(blocks_seen(max_objects=1, render_top=1, keep_threshold=0.3)[0].unique()) == 2
+    assert torch.equal(blocks_seen(max_objects=12), usual)
+    assert torch.equal(blocks_seen(max_objects=12, render_top=12, keep_threshold=0.6), usual)
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"variant": "small"}, "model.variant = 'small' would not fit the trained weights: only slots, iterations"),
-        ({"slotz": 7}, "model.slotz = 7 would not fit the trained weights: only slots, iterations can be given here."),
+        ({"variant": "small"}, "model.variant = 'small' cannot be changed for trained weights: only slots, iterations"),
+        ({"slotz": 7}, "model.slotz = 7 cannot be changed for trained weights: only slots, iterations can."),
         ({"slots": 0}, "model.slots"),
         ({"slots": "many"}, "model.slots"),
     ],

@@ -47,5 +47,5 @@ def test_what_weights_depend_on_is_refused(checkpoint: Path, command: Callable[.
     clip = encode(tmp_path / "clip.mkv", moving(2))
     ended = command("predict", f"checkpoint={checkpoint}", "trust=true", f"video={clip}", "model.hidden=8")
     assert ended.code != 0
-    assert "model.hidden = 8 would not fit the trained weights: only slots, iterations can be given here." in ended.err
+    assert "model.hidden = 8 cannot be changed for trained weights: only slots, iterations can." in ended.err
     assert not (tmp_path / "outputs" / "predict").exists()

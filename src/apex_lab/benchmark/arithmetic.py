@@ -7,9 +7,11 @@ for memory, for element-wise work, for Python, and for products that are too sma
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import torch
@@ -114,27 +116,43 @@ def matrix_rate(device: torch.device, repeats: int = 5) -> float:
     return 2 * n**3 / min(seconds)
 
 
-def shares(step: Callable[[], object], device: torch.device, seconds: Mapping[str, float]) -> dict[str, Any]:
+def shares(
+    step: Callable[[], object],
+    device: torch.device,
+    seconds: Mapping[str, float],
+    rewound: Callable[[], AbstractContextManager[object]] = contextlib.nullcontext,
+) -> dict[str, Any]:
     """FLOPs of each part of a step, and which share of `matrix_rate` the part runs at.
 
-    They are counted in one step and timed in the next: where a model leaves out work by draws, shares are approximate.
+    On a CPU one step is made twice, as a model may leave out work by draws: it is counted, taken back, and timed. On a
+    GPU, where nothing is left out, the seconds are given.
 
     Args:
         step: with parts marked by `record_function`.
         seconds: of the parts, for a GPU; on a CPU the processor's time is taken here, which waiting for other programs
             does not lengthen.
+        rewound: a step made inside is taken back, so that the next one does the same work (`Workload.rewound`).
+
+    Returns:
+        `matrix_rate` in FLOP/s; by part `flops`, `counted_seconds` that they took, `rates` in FLOP/s, which are flops /
+        counted_seconds, and `shares`, which are rates / matrix_rate; `rate` and `share` of all parts together.
     """
-    rate = matrix_rate(device)
-    counted = flops_by_part(step)
+    matrix = matrix_rate(device)
+    with rewound():
+        counted = flops_by_part(step)
     taken = processor_seconds(step) if device.type == "cpu" else dict(seconds)
     flops = {name: counted.get(name, 0) for name in {**taken, **counted}}
     taken = {name: taken.get(name, 0.0) for name in flops}
+    rates = {name: work / max(taken[name], 1e-9) for name, work in flops.items()}
+    rate = sum(flops.values()) / max(sum(taken.values()), 1e-9)
     return {
-        "matrix_rate": rate,
+        "matrix_rate": matrix,
         "flops": flops,
         "counted_seconds": taken,
-        "shares": {name: work / (rate * max(taken[name], 1e-9)) for name, work in flops.items()},
-        "share": sum(flops.values()) / (rate * max(sum(taken.values()), 1e-9)),
+        "rates": rates,
+        "shares": {name: of / matrix for name, of in rates.items()},
+        "rate": rate,
+        "share": rate / matrix,
     }
 
 

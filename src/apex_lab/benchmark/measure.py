@@ -86,7 +86,7 @@ def measure(case: Case) -> dict[str, Any]:
         row["graphs"] = counters["stats"]["unique_graphs"]
     elif case.by_part and not captured:
         row["parts"] = parts(work, case)
-        row["arithmetic"] = shares(step, device, row["parts"])
+        row["arithmetic"] = shares(step, device, row["parts"], work.rewound)
     if device.type == "cuda":
         row |= kernels(step)
     return row

@@ -62,7 +62,11 @@ def comparison(compared: Row) -> str:
 
 
 def tables(rows: Sequence[Row]) -> list[str]:
-    """All rows, then seconds by part and share of the matrix-product rate of those that have parts."""
+    """All rows, then seconds by part and share of the matrix-product rate of those that have parts.
+
+    The seconds of the second table are by the clock and under the profiler; those of the third are what its shares are
+    computed from.
+    """
     measured = [row for row in rows if row["unavailable"] is None]
     header = ["", "frames/s", "seconds", "peak memory"]
     lines = [
@@ -77,26 +81,34 @@ def tables(rows: Sequence[Row]) -> list[str]:
             [part, *(f"{row['parts'][part]:.3f}" if part in row["parts"] else "" for row in by_part)] for part in names
         ]
         total = ["sum", *(f"{sum(row['parts'].values()):.3f}" for row in by_part)]
-        made.append(_table([["seconds by part", *(name(row) for row in by_part)], *lines, total]))
-        made.append(_arithmetic(by_part, names))
+        made.append(_table([["seconds by part, by the clock", *(name(row) for row in by_part)], *lines, total]))
+        made.append(_arithmetic(by_part))
     return made
 
 
-def _arithmetic(rows: Sequence[Row], names: Sequence[str]) -> str:
-    """FLOPs by part, and which share of the rate of a plain matrix product the part runs at."""
+def _arithmetic(rows: Sequence[Row]) -> str:
+    """FLOPs by part, the seconds they took, and the rate, also as a share of that of a plain matrix product.
+
+    A line can be recomputed from itself: GFLOP / seconds = GFLOP/s = share x the rate below.
+    """
     found = [row["arithmetic"] for row in rows]
-    header = ["GFLOP, share of the matrix-product rate", *(name(row) for row in rows)]
+    header = ["GFLOP / seconds (a CPU's: processor's) = GFLOP/s, share of the rate", *(name(row) for row in rows)]
+    names = list(dict.fromkeys(part for of in found for part in of["flops"]))
+    keys = ("flops", "counted_seconds", "rates", "shares")
     lines = [
-        [part, *(_work(of["flops"][part], of["shares"][part]) if part in of["flops"] else "" for of in found)]
+        [part, *(_work(*(of[key][part] for key in keys)) if part in of["flops"] else "" for of in found)]
         for part in names
     ]
-    total = ["all", *(_work(sum(of["flops"].values()), of["share"]) for of in found)]
-    rate = ["the rate in GFLOP/s", *(f"{of['matrix_rate'] / 1e9:.4g}" for of in found)]
+    total = ["all"]
+    for of in found:
+        flops, seconds = sum(of["flops"].values()), sum(of["counted_seconds"].values())
+        total.append(_work(flops, seconds, of["rate"], of["share"]))
+    rate = ["the rate of a matrix product in GFLOP/s", *(f"{of['matrix_rate'] / 1e9:.4g}" for of in found)]
     return _table([header, *lines, total, rate])
 
 
-def _work(flops: int, share: float) -> str:
-    return f"{flops / 1e9:.4g}, {share:.0%}"
+def _work(flops: float, seconds: float, rate: float, share: float) -> str:
+    return f"{flops / 1e9:.4g} / {seconds:.4g} = {rate / 1e9:.4g}, {share:.1%}"
 
 
 def _table(lines: Sequence[Sequence[str]]) -> str:

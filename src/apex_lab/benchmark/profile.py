@@ -6,6 +6,7 @@ whole. Profiling makes a step slower; shares are what to read.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +26,8 @@ def seconds_by_part(step: Callable[[], object], device: torch.device) -> dict[st
         step: with parts marked by `record_function`, whose names contain neither "::" nor "#".
         device: the ranges' time on CUDA is that of the kernels that they launch.
     """
+    if device.type == "cpu":  # the profiler tells of its own begin and end; on a GPU also of what is wrong with CUPTI
+        os.environ.setdefault("KINETO_LOG_LEVEL", "6")
     activities = [ProfilerActivity.CPU, *([ProfilerActivity.CUDA] if device.type == "cuda" else [])]
     with profile(activities=activities, acc_events=True) as profiled, record_function(WHOLE):
         step()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import copy
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
@@ -94,6 +96,20 @@ class Workload:
     def step(self, training: bool) -> Callable[[], object]:
         """One step as a function."""
         return self.train if training else self.infer
+
+    @contextlib.contextmanager
+    def rewound(self) -> Iterator[None]:
+        """Steps made inside are taken back at the end, so that the next ones do the same work again.
+
+        The number of the step, which seeds its noise, and the weights are set back; the optimiser keeps its state,
+        which no forward or backward pass depends on.
+        """
+        number, weights = self.update.step, copy.deepcopy(self.model.state_dict())
+        try:
+            yield
+        finally:
+            self.update.step = number
+            self.model.load_state_dict(weights)
 
 
 def clip_length(config: Config) -> int:

@@ -21,15 +21,13 @@ def changed(model: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, A
         changes: argument -> value; only `SceneModel.changeable` ones can be given.
 
     Raises:
-        UserError: the weights depend on an argument, the model has no such argument, or a value is impossible.
+        UserError: an argument is not among those, the model has no such argument, or a value is impossible.
     """
     allowed = getattr(components.target_of(model, "model"), "changeable", ())
     for name, value in changes.items():
         if name not in allowed:
-            rest = (
-                f"only {', '.join(allowed)} can be given here" if allowed else "nothing of this model can be given here"
-            )
-            raise UserError(f"model.{name} = {shown(value)} would not fit the trained weights: {rest}.")
+            rest = f"only {', '.join(allowed)} can" if allowed else "nothing of this model can"
+            raise UserError(f"model.{name} = {shown(value)} cannot be changed for trained weights: {rest}.")
     found = {**model, **changes}
     components.check(found, "model")
     return found
@@ -43,7 +41,7 @@ def trained_model(inference: Mapping[str, Any], changes: Mapping[str, Any] | Non
         changes: as of `changed`.
 
     Raises:
-        UserError: the node builds no model, the weights do not fit it, or something is changed that they depend on.
+        UserError: the node builds no model, the weights do not fit it, or something is changed that cannot be.
     """
     node = changed(inference["model"], changes or {})
     with torch.random.fork_rng(devices=[]), limits.bounded(copies=1):

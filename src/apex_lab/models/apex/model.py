@@ -87,7 +87,7 @@ class Apex(SceneModel):
         "refinement": (0.0, 1.0),
     }
     optional_schedules = ("shadow", "refinement")
-    changeable = ("merges", "piece_price", "hollow_price")
+    changeable = ("max_objects", "render_top", "keep_threshold", "merges", "piece_price", "hollow_price")
 
     def __init__(
         self,
