@@ -21,6 +21,7 @@ from apex_lab.training.update import WARMUP, Mode, WeightUpdate, named_parameter
 from tests.conftest import TINY, compose_job, train_in
 from tests.test_train import record, weights, without_speed
 from tests.tiny import Layers
+from tests.training.losses import where_all_counts
 from tests.training.replayed import Refused, Replayed, traced
 
 APEX = ("model=apex", "data=p2d", "trainer=cpu", "scale=smoke")
@@ -35,6 +36,14 @@ MERGES = (
     *("model.pixel_features=4", "model.whole_colours=true", "model.start_presence=0.9", "model.start_size=0.4"),
 )
 SCALED = ("lr_scale={_target_: apex_lab.training.schedules.Linear, start: 1.0, end: 0.5, steps: 20}",)
+SMOKE = (*APEX, *MOVING, *SCALED)
+P2D = ("model=apex", "data=p2d", "trainer=cpu", "scale=cpu")
+"""The recipe that results on P2D come from: merges, shadows, refinement, loose windows and Muon."""
+BF16 = ("trainer.precision=bf16-mixed",)
+CPU = torch.device("cpu")
+FIRST = (0, 1, 2, 3, 4)
+THROUGHOUT = (0, 700, 1800, 5088, 600)
+"""Numbers of steps that P2D is replayed at: captured where all counts, then without shadows and refinement."""
 
 
 @pytest.fixture
@@ -47,9 +56,12 @@ def replayed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(updates, "Captured", Replayed)
 
 
-def workload(*words: str, mode: Mode = "eager") -> Workload:
-    made = Workload(compose_job(*APEX, *MOVING, *SCALED, *words).config, torch.device("cpu"), 1, 2, mode=mode)
-    made.update.step = 0
+def workload(*words: str, device: torch.device = CPU, mode: Mode = "eager") -> Workload:
+    """One clip of two frames, the fewest in which objects are carried on, where all counts."""
+    config = compose_job(*words).config
+    made = Workload(config, device, 1, 2, mode=mode)
+    made.update.step = where_all_counts(made, config)
+    made.update.write(made.optimizer)
     return made
 
 
@@ -57,30 +69,48 @@ def clips(like: Tensor, step: int) -> Tensor:
     return torch.randint(0, 256, like.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(step))
 
 
-def rows(made: Workload, steps: int) -> list[dict[str, float]]:
-    """Values of each step, on other clips at every other step."""
+def rows(made: Workload, steps: tuple[int, ...]) -> list[dict[str, float]]:
+    """Values of each step, on other clips at every other one."""
     assert made.optimizer is not None
     found = []
     made.model.train()
     with torch.random.fork_rng(devices=[]):
-        for step in range(steps):
-            made.update(clips(made.video, step) if step % 2 else made.video, made.optimizer)
+        for i, step in enumerate(steps):
+            made.update.step = step
+            made.update(clips(made.video, i) if i % 2 else made.video, made.optimizer)
             found.append({name: value.item() for name, value in made.update.latest.items()})
     return found
 
 
 @pytest.mark.parametrize(
-    ("words", "tolerance"),
-    [((), 1e-4), (MUON, 1e-4), (MERGES, 1e-4), (("trainer.precision=bf16-mixed",), 2e-3)],
-    ids=["Adam", "Muon", "merges and shadows", "bf16"],
+    ("words", "steps", "tolerance"),
+    [
+        (SMOKE, FIRST, 1e-4),
+        ((*SMOKE, *MUON), FIRST, 1e-4),
+        ((*SMOKE, *MERGES), FIRST, 1e-4),
+        ((*SMOKE, *BF16), FIRST, 2e-3),
+        (P2D, THROUGHOUT, 1e-4),
+        pytest.param((*P2D, *BF16), THROUGHOUT, 2e-3, marks=pytest.mark.slow),
+    ],
+    ids=["Adam", "Muon", "merges and shadows", "bf16", "P2D", "P2D in bf16"],
 )
 @pytest.mark.usefixtures("replayed", "as_on_a_gpu")
-def test_a_replayed_step_of_apex_trains_as_an_eager_one(words: tuple[str, ...], tolerance: float) -> None:
-    steps = WARMUP + 2
+def test_a_replayed_step_of_apex_trains_as_an_eager_one(
+    words: tuple[str, ...], steps: tuple[int, ...], tolerance: float
+) -> None:
+    assert len(steps) == WARMUP + 2
     eager, graph = workload(*words), workload(*words, mode="cuda graph")
     for expected, found in zip(rows(eager, steps), rows(graph, steps), strict=True):
         assert found == pytest.approx(expected, rel=tolerance)
         assert found["train/loss"] == pytest.approx(expected["train/loss"], rel=tolerance / 100)
+
+
+def test_all_counts_at_the_steps_that_are_traced() -> None:
+    made = workload(*P2D)
+    values = {**made.update.schedules.tensors(), **made.update.weights.tensors()}
+    assert all(values[name] > 0 for name in ("shadow", "refinement", "carry", "loose_windows", "kl_what"))
+    assert made.update.step in THROUGHOUT
+    assert workload(*SMOKE).update.step == 0
 
 
 def layers(mode: Mode, captured: bool) -> list[float]:
@@ -106,28 +136,34 @@ def test_a_learning_rate_that_is_no_tensor_would_be_noticed() -> None:
     assert layers("cuda graph", captured=False) != pytest.approx(layers("eager", captured=False), rel=1e-5)
 
 
-def always_the_same(made: Workload) -> int:
+def always_the_same(made: Workload, steps: tuple[int, int, int] = (1, 2, 40)) -> int:
     """Other clips, noise and schedules, frames without any object: the same operations on the same shapes.
+
+    Schedules and loss weights stay where they are in memory.
 
     Returns:
         How many operations.
     """
     update, optimizer = made.update, made.optimizer
     assert optimizer is not None
-    places = [tensor.data_ptr() for tensor in update.schedules.tensors().values()]
+
+    def scheduled() -> list[Tensor]:
+        return [tensor.detach() for each in (update.schedules, update.weights) for tensor in each.tensors().values()]
+
+    held = scheduled()  # kept, or what is made anew could lie where the old one lay
 
     def step(video: Tensor, number: int) -> list[Any]:
         update.step = number
         update.write(optimizer)
         torch.manual_seed(number)
         noise = updates.RankNoise(len(video), 0, len(video))
-        assert [tensor.data_ptr() for tensor in update.schedules.tensors().values()] == places
+        assert [tensor.data_ptr() for tensor in scheduled()] == [tensor.data_ptr() for tensor in held]
         return traced(lambda: update._work(video, optimizer, noise, Tensor.backward, optimizer.step))
 
     with torch.random.fork_rng(devices=[]):
         made.train()  # makes the optimiser's state
-        expected = step(made.video, 1)
-        for number, video in ((2, clips(made.video, 0)), (40, torch.full_like(made.video, 128))):
+        expected = step(made.video, steps[0])
+        for number, video in zip(steps[1:], (clips(made.video, 0), torch.full_like(made.video, 128)), strict=True):
             assert step(video, number) == expected
     return len(expected)
 
@@ -136,8 +172,8 @@ def always_the_same(made: Workload) -> int:
     "words",
     [
         MUON,
-        ("trainer.precision=bf16-mixed",),
-        (*MERGES, "trainer.precision=bf16-mixed"),
+        BF16,
+        (*MERGES, *BF16),
         MERGES,
         pytest.param(("+ablation=image_stn",), marks=pytest.mark.slow),
         pytest.param(("+ablation=gaussian_scalor_norm",), marks=pytest.mark.slow),
@@ -146,7 +182,15 @@ def always_the_same(made: Workload) -> int:
 )
 @pytest.mark.usefixtures("as_on_a_gpu")
 def test_the_step_is_the_same_whatever_it_sees(words: tuple[str, ...]) -> None:
-    assert always_the_same(workload(*words, mode="cuda graph")) > 2000
+    assert always_the_same(workload(*SMOKE, *words, mode="cuda graph")) > 2000
+
+
+@pytest.mark.parametrize("words", [(), pytest.param(BF16, marks=pytest.mark.slow)], ids=["float32", "bf16"])
+@pytest.mark.usefixtures("as_on_a_gpu")
+def test_the_step_of_p2d_too(words: tuple[str, ...]) -> None:
+    """Where all counts, without shadows and refinement, and in between."""
+    made = workload(*P2D, *words, mode="cuda graph")
+    assert always_the_same(made, (made.update.step, 600, 1800)) > 2000
 
 
 @pytest.mark.slow
@@ -154,10 +198,10 @@ def test_the_step_is_the_same_whatever_it_sees(words: tuple[str, ...]) -> None:
 @pytest.mark.usefixtures("as_on_a_gpu")
 def test_the_step_of_other_models_too(model: str) -> None:
     config = compose_job(f"model={model}", "data=sprites", "scale=smoke", "trainer=cpu").config
-    assert always_the_same(Workload(config, torch.device("cpu"), 2, 3, mode="cuda graph")) > 500
+    assert always_the_same(Workload(config, CPU, 2, 3, mode="cuda graph")) > 500
 
 
-@pytest.mark.parametrize("words", [(), MERGES], ids=["paper", "merges and shadows"])
+@pytest.mark.parametrize("words", [SMOKE, (*SMOKE, *MERGES), P2D], ids=["paper", "merges and shadows", "P2D"])
 @pytest.mark.usefixtures("as_on_a_gpu")
 def test_inference_is_the_same_whatever_it_sees(words: tuple[str, ...]) -> None:
     made = workload(*words)
@@ -187,13 +231,16 @@ class OnOneDevice(TorchDispatchMode):
         return results
 
 
-@pytest.mark.parametrize("words", [(), MUON, MERGES], ids=["Adam", "Muon", "merges and shadows"])
+@pytest.mark.parametrize(
+    "words",
+    [APEX, (*APEX, *MUON), (*APEX, *MERGES), P2D],
+    ids=["Adam", "Muon", "merges and shadows", "P2D"],
+)
 @pytest.mark.usefixtures("as_on_a_gpu")
 def test_nothing_of_the_step_lies_on_the_host(words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch) -> None:
     """The device `meta` has shapes without numbers: whatever asks for a number raises."""
     monkeypatch.setattr(torch, "autocast", lambda *_, **__: contextlib.nullcontext())  # there is none for `meta`
-    config = compose_job(*APEX, *words).config
-    made = Workload(config, torch.device("meta"), 1, 2, mode="cuda graph")
+    made = workload(*words, device=torch.device("meta"), mode="cuda graph")
     assert made.optimizer is not None
     made.model.train()
     with OnOneDevice():
