@@ -90,9 +90,8 @@ def rows(made: Workload, steps: tuple[int, ...]) -> list[dict[str, float]]:
         ((*SMOKE, *MERGES), FIRST, 1e-4),
         ((*SMOKE, *BF16), FIRST, 2e-3),
         (P2D, THROUGHOUT, 1e-4),
-        pytest.param((*P2D, *BF16), THROUGHOUT, 2e-3, marks=pytest.mark.slow),
     ],
-    ids=["Adam", "Muon", "merges and shadows", "bf16", "P2D", "P2D in bf16"],
+    ids=["Adam", "Muon", "merges and shadows", "bf16", "P2D"],
 )
 @pytest.mark.usefixtures("replayed", "as_on_a_gpu")
 def test_a_replayed_step_of_apex_trains_as_an_eager_one(
