@@ -20,7 +20,7 @@ from PIL import Image
 
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import set_aside, unwritable, write_text
+from apex_lab.base.files import make_folder, replacing, set_aside, unwritable, write_text
 from apex_lab.base.validation import one_line
 from apex_lab.base.wandb_account import credentials
 from apex_lab.runs.folder import Run, group_name
@@ -183,6 +183,7 @@ class Wandb(Logger, Showing):
     ) -> None:
         super().__init__()
         self._run, self.pictures, self.pictures_every = run, pictures, pictures_every
+        self._folder = run.folder / "wandb"
         self._unknown = run.record.get("wandb_id") is None  # to wandb, so that it has none of the curves yet
         if self._unknown:
             run.update(wandb_id=secrets.token_hex(4))
@@ -247,7 +248,8 @@ class Wandb(Logger, Showing):
             for at, values in curves.values():
                 self._log(values, at)
         elif curves is not None and curves.open_row is not None:
-            self._log(curves.open_row[1], curves.open_row[0])
+            at, values = curves.open_row
+            self._log({**values, **self._last_picture(at)}, at)
 
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         """Sends values at a step of training, which is wandb's own step too, so that a resumed run goes on there."""
@@ -261,10 +263,27 @@ class Wandb(Logger, Showing):
         """Nothing: the configuration is sent at the start."""
 
     def picture(self, name: str, page: Image.Image, step: int) -> None:
-        """Sends a picture of a step of training."""
+        """Sends a picture of a step of training.
+
+        wandb keeps it until the next step, as it keeps values. These stand in curves.csv too; the picture is kept as a
+        file, until the next one.
+        """
         import wandb
 
+        kept = make_folder(self._folder) / f"{name.replace('/', '.')}.{step}.png"
+        with replacing(kept) as file:
+            page.save(file, "png")
+        for earlier in self._folder.glob(f"{name.replace('/', '.')}.*.png"):
+            if earlier != kept:
+                earlier.unlink()
         self._log({name: wandb.Image(page)}, step)
+
+    def _last_picture(self, step: int) -> dict[str, Any]:
+        """The pictures of a step that were kept."""
+        import wandb
+
+        names = {path: path.name.removesuffix(f".{step}.png") for path in self._folder.glob(f"*.{step}.png")}
+        return {name.replace(".", "/"): wandb.Image(str(path)) for path, name in names.items()}
 
     def results(self, split: str, scored: Mapping[str, Any], pictures: Sequence[Path], step: int) -> None:
         """Sends the final scores as summary, the scores of each video as a table, and the pictures."""
