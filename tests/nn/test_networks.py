@@ -81,6 +81,7 @@ def test_a_crop_s_code_is_that_of_its_convolutions_and_a_weighted_sum_of_its_pix
     torch.manual_seed(2)
     net = GlimpseEncoder(2, 6, 8, 5).double()
     crops = torch.randn(3, 2, 6, 6, dtype=torch.float64)
+    assert net.shortcut is not None
     weights = net.shortcut.weight.tolist()
     sums = torch.zeros(3, 5, dtype=torch.float64)
     for n, crop in enumerate(crops.tolist()):
@@ -92,6 +93,9 @@ def test_a_crop_s_code_is_that_of_its_convolutions_and_a_weighted_sum_of_its_pix
     for part in (seen, sums):
         assert part.std() > 0.1
     torch.testing.assert_close(net(crops), seen + sums, rtol=0, atol=1e-12)
+    plain = GlimpseEncoder(2, 6, 8, 5, shortcut=False).double()
+    plain.load_state_dict({name: value for name, value in net.state_dict().items() if name != "shortcut.weight"})
+    torch.testing.assert_close(plain(crops), seen, rtol=0, atol=1e-12)
 
 
 @torch.no_grad()

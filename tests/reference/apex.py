@@ -135,7 +135,7 @@ class Straightforward(Apex):
         lstm = self.encoder.over_time
         frame = self.encoder.of_images(video[:, i])
         memory.hidden, memory.cell = lstm.step(lstm.from_input(frame), memory.hidden, memory.cell)
-        features = (frame + memory.hidden)[:, None]
+        features = (frame + memory.hidden if self.encoder.colour is not None else memory.hidden)[:, None]
         before = features if memory.features is None else memory.features
         memory.features = features
         pair = torch.cat([before, features], dim=1)

@@ -31,6 +31,8 @@ ADDED: dict[str, Any] = {
     "model.pixel_features": 0,
     "model.whole_colours": False,
     "model.background.shadow": 1.0,
+    "model.encoder.shortcuts": True,  # APEX, and the next one
+    "model.glimpses.shortcut": True,
 }
 """Keys added since `FORMAT` was raised, with the value that they had before they existed."""
 

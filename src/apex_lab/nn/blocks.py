@@ -65,16 +65,17 @@ class _Maps(nn.Module):
 class GlimpseEncoder(nn.Module):
     """CNN from a crop to a vector: strided convolutions down to 4 x 4 or less, then one linear layer.
 
-    A linear shortcut from the crop itself adds to the code, so that the crop's content is in it from the first step on.
+    A linear shortcut from the crop may add to the code, so that the crop's content is in it from the first step on.
 
     Args:
         channels: of the crop.
         size: side of the crop in pixels.
         width: channels of the convolutions.
         outputs: length of the code.
+        shortcut: whether there is the shortcut.
     """
 
-    def __init__(self, channels: int, size: int, width: int, outputs: int) -> None:
+    def __init__(self, channels: int, size: int, width: int, outputs: int, shortcut: bool = True) -> None:
         super().__init__()
         layers: list[nn.Module] = [conv_norm(channels, width)]
         full = size
@@ -83,10 +84,11 @@ class GlimpseEncoder(nn.Module):
             size = (size + 1) // 2
         self.convs = nn.Sequential(*layers)
         self.head = nn.Sequential(nn.Linear(width * size * size, outputs), nn.CELU())
-        self.shortcut = nn.Linear(channels * full * full, outputs, bias=False)
+        self.shortcut = nn.Linear(channels * full * full, outputs, bias=False) if shortcut else None
 
     def forward(self, crops: Float[Tensor, "N C g g"]) -> Float[Tensor, "N outputs"]:
-        return self.head(self.convs(for_convolutions(crops)).flatten(1)) + self.shortcut(crops.flatten(1))
+        code = self.head(self.convs(for_convolutions(crops)).flatten(1))
+        return code if self.shortcut is None else code + self.shortcut(crops.flatten(1))
 
 
 class SubpixelDecoder(nn.Module):

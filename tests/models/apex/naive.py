@@ -55,6 +55,11 @@ def normal(raw: Tensor) -> tuple[Tensor, Tensor]:
     return mean, (torch.log1p(spread.exp()) + 1e-3).clamp_max(5.0)
 
 
+def appearance(model: Apex, hidden: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
+    """q(z_what) of one object; the glimpse's code goes past the RNN where the model has that shortcut."""
+    return normal(model.appearance.head(torch.cat([hidden, code]) if model.glimpses.shortcut else hidden))
+
+
 def frame_masks(
     alphas: list[Tensor], presences: list[Tensor], windows: list[Tensor], c: float, size: int
 ) -> tuple[list[Tensor], Tensor, Tensor]:
@@ -159,7 +164,7 @@ def propagate(model: Apex, e: Tensor, thing: Thing, told: Told) -> Thing:
 
     code = glimpses.glimpse(cut(e, moved.window, glimpses.size)[None])[0]
     what = recur(model.appearance.rnn, thing.hidden["what"], code, thing.what)
-    q_what = normal(model.appearance.head(torch.cat([what, code])))
+    q_what = appearance(model, what, code)
     pres = recur(net.rnn_pres, thing.hidden["pres"], c_p, q_what[0], presence)
     q_pres = float(torch.sigmoid(net.head_pres(pres)))
 
@@ -218,7 +223,7 @@ def discover(model: Apex, e: Tensor, scope: Tensor, p0: float, told: Told) -> li
             code = glimpses.glimpse(cut(e, thing.window, glimpses.size)[None])[0]
             what_0 = torch.zeros(model.appearance.what, dtype=torch.float64)
             thing.hidden = hidden | {"what": recur(model.appearance.rnn, nothing, code, what_0)}
-            q_what = normal(model.appearance.head(torch.cat([thing.hidden["what"], code])))
+            q_what = appearance(model, thing.hidden["what"], code)
             thing.what = q_what[0]
             proposal = torch.sigmoid(net.head_pres(torch.cat([c_d, thing.what, thing.window])))
 

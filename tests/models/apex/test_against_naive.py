@@ -7,7 +7,7 @@ import itertools
 import pytest
 import torch
 
-from apex_lab.models.apex import Apex, Background
+from apex_lab.models.apex import Apex, ApexEncoder, Background, FeatureGlimpses
 from apex_lab.scene import Context, schedule_at
 from tests.models.apex import naive
 from tests.models.apex.small import SCHEDULE, SIZE, lively, video
@@ -48,6 +48,12 @@ def test_masks_identities_and_every_term_of_the_objective(slots: int, render_top
         assert any(after - before for before, after in pairs)  # some come later
         assert 0.0 < min(one.contexts) < 0.5  # some cells are explained already
         assert max(one.contexts) > 0.9
+
+
+def test_without_the_shortcuts_of_encoder_and_glimpses() -> None:
+    encoder = ApexEncoder(8, (4, 4, 6, 8, 8, 8), (1, 1, 1, 1), shortcuts=False)
+    model = lively(encoder=encoder, glimpses=FeatureGlimpses(4, 6, shortcut=False)).double().eval()
+    check(model, video(2, 4).double())
 
 
 @pytest.mark.parametrize("shadow", [1.0, 0.7])

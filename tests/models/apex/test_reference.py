@@ -49,10 +49,18 @@ VIDEO = torch.rand(3, 4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
         (ALL, ("model.render_top=null",)),
         (AS_MANY, ()),
         (ALL, ("model.render_top=null", "+ablation=image_stn")),
+        (ALL, ("model.render_top=null", "model.encoder.shortcuts=false", "model.glimpses.shortcut=false")),
         pytest.param(ALL, ("model.render_top=null", "+ablation=gaussian_scalor_norm"), marks=pytest.mark.slow),
         pytest.param(ALL, ("model.render_top=null", "model.likelihood.mixture_over=pixel"), marks=pytest.mark.slow),
     ],
-    ids=["all", "as many", "all, image_stn", "all, gaussian_scalor_norm", "all, mixture over pixels"],
+    ids=[
+        "all",
+        "as many",
+        "all, image_stn",
+        "all, no shortcuts",
+        "all, gaussian_scalor_norm",
+        "all, mixture over pixels",
+    ],
 )
 def test_the_twin_gives_the_same_terms_masks_and_gradients(twin: str, words: tuple[str, ...]) -> None:
     model, other, context = pair(*words, twin=twin)

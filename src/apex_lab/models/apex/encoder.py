@@ -28,21 +28,27 @@ class ApexEncoder(nn.Module):
         features: F.
         widths: channels of the DLA's six levels (strides 1, 2, 4, 8, 16, 32).
         depths: depths of its four aggregation trees.
+        shortcuts: whether there are the two above; without them e_t is the hidden state of the ConvLSTM.
     """
 
     stride = 4
 
-    def __init__(self, features: Count, widths: Sequence[Count], depths: Sequence[Count]) -> None:
+    def __init__(
+        self, features: Count, widths: Sequence[Count], depths: Sequence[Count], shortcuts: bool = True
+    ) -> None:
         super().__init__()
         self.features = features
         self.dla = DLA(features, widths, depths)
-        self.colour = nn.Conv2d(3, features, 1, bias=False)
-        nn.init.normal_(self.colour.weight)
+        self.colour = nn.Conv2d(3, features, 1, bias=False) if shortcuts else None
+        if self.colour is not None:
+            nn.init.normal_(self.colour.weight)
         self.over_time = ConvLSTM(features)
 
     def of_images(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N F H/4 W/4"]:
         """RGB in [0, 1] -> features of each frame by itself."""
         centred = images - 0.5
+        if self.colour is None:
+            return self.dla(centred)
         return self.dla(centred) + self.colour(F.avg_pool2d(centred, self.stride))
 
     def forward(
@@ -54,4 +60,4 @@ class ApexEncoder(nn.Module):
         """
         frames = self.of_images(video.flatten(0, 1)).unflatten(0, video.shape[:2])
         hidden, state = self.over_time(frames, state)
-        return frames + hidden, state
+        return hidden if self.colour is None else frames + hidden, state

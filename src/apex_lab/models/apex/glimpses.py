@@ -24,20 +24,23 @@ class Glimpses(nn.Module, ABC):
     Args:
         size: side of a crop in pixels of a feature map; crops of the image have twice as many.
         width: channels of the two CNNs.
+        shortcut: whether a weighted sum of a crop's values adds to its code, and codes of glimpses go to z_what's head
+            past the RNN too. Not in the paper: colours reach z_what within hundreds of steps.
     """
 
     pixels_per_size = 1
 
-    def __init__(self, size: Size, width: Count) -> None:
+    def __init__(self, size: Size, width: Count, shortcut: bool = True) -> None:
         super().__init__()
+        self.shortcut = shortcut
         self.size, self.width = size * self.pixels_per_size, width
         self.crop = crop  # an attribute, so that a benchmark can put another spatial transformer in its place
 
     def build(self, features: int, code: int) -> None:
         """Makes the CNNs; called once by the model, which knows F and the length of a code."""
         glimpse, propagation = self.channels(features)
-        self.glimpse = GlimpseEncoder(glimpse, self.size, self.width, code)
-        self.propagation = GlimpseEncoder(propagation, self.size, self.width, code)
+        self.glimpse = GlimpseEncoder(glimpse, self.size, self.width, code, self.shortcut)
+        self.propagation = GlimpseEncoder(propagation, self.size, self.width, code, self.shortcut)
 
     @abstractmethod
     def channels(self, features: int) -> tuple[int, int]:

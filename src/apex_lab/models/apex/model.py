@@ -144,7 +144,7 @@ class Apex(SceneModel):
         self.masks, self.likelihood, self.discovery_prior = masks, likelihood, discovery_prior
         self.encoder, self.glimpses, self.background = encoder, glimpses, background
         windows = Windows(grid, reach, size_step, centre_step)
-        self.appearance = Appearance(hidden, what, hidden, start_std)
+        self.appearance = Appearance(hidden, what, hidden, start_std, glimpses.shortcut)
         self.propagation = Propagation(hidden, what, hidden, windows)
         self.discovery = Discovery(
             encoder.features, grid, what, hidden, windows, size_logit(start_size), start_presence

@@ -104,13 +104,21 @@ def _set_last_bias(network: nn.Sequential, values: Float[Tensor, " n"], shrink: 
 
 
 class Appearance(nn.Module):
-    """q(z_what): one RNN on [glimpse code, z_what_{t-1}], shared by propagation and discovery (z_what_0 = 0)."""
+    """q(z_what): one RNN on [glimpse code, z_what_{t-1}], shared by propagation and discovery (z_what_0 = 0).
 
-    def __init__(self, code: int, what: int, hidden: int, start_std: float) -> None:
+    Args:
+        code: length of a glimpse code.
+        what: length of z_what.
+        hidden: of the RNN.
+        start_std: standard deviation of q at the start of training.
+        shortcut: whether the head sees the code too; not in the paper.
+    """
+
+    def __init__(self, code: int, what: int, hidden: int, start_std: float, shortcut: bool = True) -> None:
         super().__init__()
-        self.what = what
+        self.what, self.shortcut = what, shortcut
         self.rnn = nn.GRUCell(code + what, hidden)
-        self.head = nn.Linear(hidden + code, 2 * what)
+        self.head = nn.Linear(hidden + code if shortcut else hidden, 2 * what)
         # Start as a network without memory: then a propagated object looks just as it would if it were discovered in
         # its window, and its presence does not die before propagation has learned anything.
         with torch.no_grad():
@@ -123,7 +131,8 @@ class Appearance(nn.Module):
     def forward(self, code: Tensor, what: Tensor, hidden: Tensor) -> tuple[Gaussian, Tensor]:
         """(N, code), (N, Z), (N, hidden) -> q(z_what), new hidden state."""
         hidden = self.rnn(torch.cat([code, what], dim=-1), hidden)
-        return gaussian_from(self.head(torch.cat([hidden, code], dim=-1))), hidden
+        seen = torch.cat([hidden, code], dim=-1) if self.shortcut else hidden
+        return gaussian_from(self.head(seen)), hidden
 
 
 class Propagation(nn.Module):
