@@ -19,6 +19,7 @@ import pytest
 import torch
 from filelock import FileLock
 
+from apex_lab.data.loading import GRACE
 from apex_lab.runs import checkpoints
 from apex_lab.train import main
 from tests.conftest import TINY, Ended, wait_for_step
@@ -59,6 +60,19 @@ def start(folder: Path, *words: str, code: str = "from apex_lab.train import mai
         stderr=subprocess.PIPE,
         text=True,
     )
+
+
+def test_an_error_ends_the_command_at_once_though_loaders_outlive_a_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    process = start(tmp_path, "++data.workers=2", "logger=wandb", *LONG)
+    pictures = wait_for_step(tmp_path, 3) / "wandb" / "last_picture.val%2Fpictures.20.png"
+    (pictures / "in the way").mkdir(parents=True)
+    _, err = process.communicate(timeout=45)  # a loading process may live for longer
+    assert process.returncode == 1
+    assert f"{pictures.name} cannot be written" in err
+    assert GRACE > 45
 
 
 def test_a_run_leaves_everything_and_says_so(train: Callable[..., Ended], the_run: Callable[..., Path]) -> None:

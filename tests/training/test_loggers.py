@@ -159,6 +159,7 @@ def test_wandb_offline_is_complete_also_after_a_kill_and_resumption(
         assert (again["_step"], again["val/pictures"]["_type"]) == (6, "image-file")
     with open(run / "curves.csv", newline="") as file:
         rows = {int(row["step"]): row for row in csv.DictReader(file)}
+    assert [path.name for path in (run / "wandb").glob("last_picture*")] == ["last_picture.val%2Fpictures.12.png"]
     sent: dict[int, dict[str, Any]] = {}
     for row in (*wandb_file.history(first), *wandb_file.history(second)):
         sent.setdefault(row["_step"], {}).update(row)
@@ -186,6 +187,30 @@ def test_wandb_offline_is_complete_also_after_a_kill_and_resumption(
     table = json.loads((files / shown["test/per_video"]["path"]).read_text())
     place = table["columns"].index("ari_fg")
     assert [row[place] for row in table["data"]] == [row["ari_fg"] for row in scored["per_video"]]
+
+
+def test_wandb_goes_on_without_a_kept_picture_that_is_damaged(
+    train: Callable[..., Ended], the_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("TINY_BROKEN_AT", "7")
+    words = ("logger=wandb", "trainer.max_steps=9", "trainer.checkpoint_interval=3")
+    assert train(*words).code == 1
+    monkeypatch.delenv("TINY_BROKEN_AT")
+    run = the_run()
+    kept = [line for line in lines(run / "curves.csv") if not line.startswith("7,")]
+    (run / "curves.csv").write_text("\n".join(kept) + "\n")
+    [picture] = (run / "wandb").glob("last_picture.*.6.png")
+    picture.write_bytes(picture.read_bytes()[:-100])
+    (run / "wandb" / "notes.6.png").write_bytes(b"the user's own")
+    ended = train(*words)
+    assert ended.code == 0, ended.err
+    assert f"wandb: {picture} cannot be read" in ended.err
+    assert "notes.6.png" not in ended.err
+    again = wandb_file.history(wandb_file.records(next(offline_folders(run)[1].glob("*.wandb"))))[0]
+    assert again["_step"] == 6
+    assert "val/pictures" not in again
+    assert "val/loss" in again
 
 
 def test_wandb_shows_pictures_and_changes_no_number(

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from apex_lab.data.clips import ClipSampler
+from apex_lab.data.loading import stop
 from apex_lab.data.video_set import Clip, Item, VideoSet
 
 
@@ -34,9 +35,12 @@ class Resident:
             at += videos.length(clip.video)
         self._frames = torch.empty(at, 3, *videos.image_size, dtype=torch.uint8, device=device)
         read: DataLoader[Item] = DataLoader(videos, batch_size=None, sampler=whole, **options)
-        for clip, item in zip(whole, read, strict=True):
-            first = self._first[clip.video, clip.view]
-            self._frames[first : first + videos.length(clip.video)].copy_(item["video"], non_blocking=True)
+        try:
+            for clip, item in zip(whole, read, strict=True):
+                first = self._first[clip.video, clip.view]
+                self._frames[first : first + videos.length(clip.video)].copy_(item["video"], non_blocking=True)
+        finally:
+            stop(read)
 
     def __len__(self) -> int:
         return len(self._batches)

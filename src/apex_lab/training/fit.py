@@ -21,6 +21,7 @@ from apex_lab.config.building import build_clip_frames, build_lr_scale, build_op
 from apex_lab.config.schema import Config
 from apex_lab.data import VideoSource, training_loader, whole_loader
 from apex_lab.data.loaders import Loader
+from apex_lab.data.loading import stop
 from apex_lab.data.resident import Resident
 from apex_lab.scene import SceneModel
 from apex_lab.training.callbacks import LastValidation, Lockstep, not_restored
@@ -95,7 +96,11 @@ def fit(
         rank=ranks.rank,
         ranks=ranks.world,
     )
-    trainer.fit(learner, batches, validation if settings.validation_interval is not None else None)
+    try:
+        trainer.fit(learner, batches, validation if settings.validation_interval is not None else None)
+    finally:
+        if not isinstance(batches, Resident):
+            stop(batches)
     if ranks.world > 1 and dist.is_initialized():
         dist.destroy_process_group()
     if learner.stop:

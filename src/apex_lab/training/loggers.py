@@ -14,6 +14,7 @@ from argparse import Namespace
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import quote, unquote
 
 from lightning.pytorch.loggers import Logger
 from PIL import Image
@@ -156,6 +157,9 @@ TIMEOUT = 30.0
 """Seconds that wandb's server has to answer before a run is logged offline; ten times that for the last upload."""
 
 
+KEPT = "last_picture"
+"""How names of files begin that hold pictures until the next one, in the run's folder `wandb`."""
+
 FLUSH = 0.2
 """Seconds that values wait in wandb's process before they are in an offline run's file; a kill can cost that much."""
 
@@ -249,7 +253,7 @@ class Wandb(Logger, Showing):
                 self._log(values, at)
         elif curves is not None and curves.open_row is not None:
             at, values = curves.open_row
-            self._log({**values, **self._last_picture(at)}, at)
+            self._log({**values, **self._last_pictures(at)}, at)
 
     def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None:
         """Sends values at a step of training, which is wandb's own step too, so that a resumed run goes on there."""
@@ -270,20 +274,28 @@ class Wandb(Logger, Showing):
         """
         import wandb
 
-        kept = make_folder(self._folder) / f"{name.replace('/', '.')}.{step}.png"
+        of_name = f"{KEPT}.{quote(name, safe='')}"
+        kept = make_folder(self._folder) / f"{of_name}.{step}.png"
         with replacing(kept) as file:
             page.save(file, "png")
-        for earlier in self._folder.glob(f"{name.replace('/', '.')}.*.png"):
+        for earlier in self._folder.glob(f"{of_name}.*.png"):
             if earlier != kept:
                 earlier.unlink()
         self._log({name: wandb.Image(page)}, step)
 
-    def _last_picture(self, step: int) -> dict[str, Any]:
-        """The pictures of a step that were kept."""
+    def _last_pictures(self, step: int) -> dict[str, Any]:
+        """The pictures of a step that were kept; a damaged one is left out with a warning."""
         import wandb
 
-        names = {path: path.name.removesuffix(f".{step}.png") for path in self._folder.glob(f"*.{step}.png")}
-        return {name.replace(".", "/"): wandb.Image(str(path)) for path, name in names.items()}
+        found = {}
+        for path in self._folder.glob(f"{KEPT}.*.{step}.png"):
+            try:
+                with Image.open(path) as page:
+                    page.load()
+                    found[unquote(path.name.split(".")[1])] = wandb.Image(page)
+            except Exception as error:  # noqa: BLE001 - Pillow has many kinds for a damaged file
+                console.warn(f"wandb: {path} cannot be read ({one_line(error)}); this picture is not sent again.")
+        return found
 
     def results(self, split: str, scored: Mapping[str, Any], pictures: Sequence[Path], step: int) -> None:
         """Sends the final scores as summary, the scores of each video as a table, and the pictures."""
