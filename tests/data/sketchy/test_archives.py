@@ -16,6 +16,8 @@ from apex_lab.data.sketchy.archives import extract_all
 from apex_lab.data.sketchy.files import find
 from tests.data.sketchy.episodes import episode_name
 
+pytestmark = pytest.mark.skipif(not hasattr(tarfile, "data_filter"), reason="Python before 3.11.4 has no filter")
+
 
 def content(number: int) -> bytes:
     """What stands for an episode here: extraction does not look into files."""

@@ -119,6 +119,18 @@ def test_what_is_damaged_is_named_counted_and_keeps_its_place_in_the_split(
     assert "7 episodes with 7 timesteps, 3 skipped." in capsys.readouterr().out
 
 
+def test_a_python_without_filters_reads_no_archive(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delattr(tarfile, "data_filter", raising=False)
+    (tmp_path / "files").mkdir()
+    tarfile.open(tmp_path / "files" / "a.tar.bz2", "w:bz2").close()
+    with pytest.raises(SystemExit):
+        main(words(tmp_path))
+    assert "needs Python 3.11.4" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not hasattr(tarfile, "data_filter"), reason="Python before 3.11.4 has no filter")
 def test_archives_give_the_same_recording_as_their_episodes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = folder_of(tmp_path, dict.fromkeys(range(10), 1))
     main(words(tmp_path, "--windows", "full", "--name", "loose"))
