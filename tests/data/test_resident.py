@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from torch.utils.data import DataLoader
 from apex_lab.data import Clip, ClipSampler, VideoSet, VideoSource
 from apex_lab.data.clips import Starts
 from apex_lab.data.loaders import training_loader
+from apex_lab.data.loading import options
 from apex_lab.data.resident import Resident, size, worth_it
 from tests.conftest import TINY, train_in
 from tests.test_train import equal
@@ -45,6 +47,11 @@ class Numbered(VideoSet):
         return {"video": video, "segmentation": video[:, 0]}
 
 
+class Unreadable(Numbered):
+    def read(self, clip: Clip) -> dict[str, Tensor]:
+        raise RuntimeError("unreadable")
+
+
 class Source(VideoSource):
     """Nothing to prepare."""
 
@@ -74,6 +81,19 @@ def test_batches_are_those_of_a_loader(starts: Starts, frames: Callable[[int], i
             assert found["video"].dtype == torch.uint8
             assert torch.equal(found["index"], expected["index"])
             assert found["name"] == expected["name"]
+
+
+def test_processes_that_read_them_end_with_the_reading() -> None:
+    batches = training_loader(Source(), 4, 7, 3, 12, lambda step: 3).batch_sampler
+    assert isinstance(batches, ClipSampler)
+    before = set(multiprocessing.active_children())
+    kept = Resident(Numbered(), batches, torch.device("cpu"), **options(2))
+    assert set(multiprocessing.active_children()) == before
+    for expected, found in zip(Resident(Numbered(), batches, torch.device("cpu")), kept, strict=True):
+        assert torch.equal(found["video"], expected["video"])
+    with pytest.raises(RuntimeError, match="unreadable"):
+        Resident(Unreadable(), batches, torch.device("cpu"), **options(2))
+    assert set(multiprocessing.active_children()) == before
 
 
 def test_they_lie_on_a_gpu_where_they_fit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -108,6 +108,12 @@ def offline_folders(run: Path) -> list[Path]:
     return sorted((run / "wandb").glob("offline-run-*"))
 
 
+def as_killed_after_step_6(run: Path) -> None:
+    """Takes from the curves what a run that broke at step 7 logged there."""
+    kept = [line for line in lines(run / "curves.csv") if not line.startswith("7,")]
+    (run / "curves.csv").write_text("\n".join(kept) + "\n")
+
+
 @pytest.mark.parametrize("killed", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_wandb_offline_is_complete_also_after_a_kill_and_resumption(
     killed: bool,
@@ -129,8 +135,7 @@ def test_wandb_offline_is_complete_also_after_a_kill_and_resumption(
         assert train(*words).code == 1
         monkeypatch.delenv("TINY_BROKEN_AT")
         run = the_run()
-        kept = [line for line in lines(run / "curves.csv") if not line.startswith("7,")]
-        (run / "curves.csv").write_text("\n".join(kept) + "\n")  # as a kill right after step 6 leaves it
+        as_killed_after_step_6(run)
     name = json.loads((run / "run.json").read_text())["wandb_id"]
     (run / "run.json").unlink()  # the checkpoint knows the id too
     ended = train(*words)
@@ -198,8 +203,7 @@ def test_wandb_goes_on_without_a_kept_picture_that_is_damaged(
     assert train(*words).code == 1
     monkeypatch.delenv("TINY_BROKEN_AT")
     run = the_run()
-    kept = [line for line in lines(run / "curves.csv") if not line.startswith("7,")]
-    (run / "curves.csv").write_text("\n".join(kept) + "\n")
+    as_killed_after_step_6(run)
     [picture] = (run / "wandb").glob("last_picture.*.6.png")
     picture.write_bytes(picture.read_bytes()[:-100])
     (run / "wandb" / "notes.6.png").write_bytes(b"the user's own")

@@ -289,10 +289,11 @@ class Wandb(Logger, Showing):
 
         found = {}
         for path in self._folder.glob(f"{KEPT}.*.{step}.png"):
+            name = unquote(path.name.removeprefix(f"{KEPT}.").removesuffix(f".{step}.png"))
             try:
                 with Image.open(path) as page:
                     page.load()
-                    found[unquote(path.name.split(".")[1])] = wandb.Image(page)
+                    found[name] = wandb.Image(page)
             except Exception as error:  # noqa: BLE001 - Pillow has many kinds for a damaged file
                 console.warn(f"wandb: {path} cannot be read ({one_line(error)}); this picture is not sent again.")
         return found

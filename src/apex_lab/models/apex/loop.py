@@ -219,7 +219,7 @@ def may_discover(carried_on: Tensor, schedule: Schedule, noise: Noise | None) ->
 
     Rediscovering everything in every frame explains a video as well as tracking does, for the price of a few KL
     terms, and in early trials the presence of propagated objects died and did not revive. So in training a video
-    that carries objects is now and then left to them alone (a conjecture; not yet ablated by itself).
+    that carries objects is now and then left to them alone (a conjecture; measured in docs/apex.md).
     """
     if noise is None:
         return torch.ones_like(carried_on)
