@@ -14,10 +14,12 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
+from torch.autograd.profiler_util import Interval, Kernel
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -27,7 +29,7 @@ from apex_lab.benchmark import arithmetic, child, compare
 from apex_lab.benchmark import printed as report
 from apex_lab.benchmark.arithmetic import flops_by_part, processor_seconds, shares
 from apex_lab.benchmark.measure import Case, measure
-from apex_lab.benchmark.profile import REST, seconds_by_part
+from apex_lab.benchmark.profile import REST, _by_kernels, seconds_by_part
 from apex_lab.benchmark.work import Workload
 from apex_lab.config.job import check_job
 from apex_lab.training import update as updates
@@ -217,6 +219,38 @@ def test_a_part_s_time_is_without_the_parts_inside_it() -> None:
         assert slept <= seconds[name] < slept + 0.1, name
 
 
+def test_on_a_gpu_a_part_s_time_is_that_of_its_kernels() -> None:
+    """By events as PyTorch's profiler gives them, in microseconds: a range of the host's has a copy on the GPU."""
+    on_host, on_gpu = torch.autograd.DeviceType.CPU, torch.autograd.DeviceType.CUDA
+
+    def event(
+        name: str, start: float, end: float, thread: int = 1, where: Any = on_host, **kernels: float
+    ) -> SimpleNamespace:
+        return SimpleNamespace(
+            name=name,
+            is_user_annotation=name in {"step", "forward", "encoder", "backward"},
+            device_type=where,
+            thread=thread,
+            time_range=Interval(start, end),
+            kernels=[Kernel(kernel, 0, duration) for kernel, duration in kernels.items()],
+        )
+
+    events = [
+        event("step", 0, 100, step=900),  # the copies of ranges are listed among the kernels of the ranges
+        event("forward", 10, 40, forward=300),
+        event("encoder", 12, 20),
+        event("backward", 50, 90),
+        event("aten::conv", 13, 14, gemm=100),
+        event("aten::add", 30, 31, elementwise=20, copy=3),
+        event("aten::conv_backward", 60, 61, thread=2, gemm=200),  # autograd's own thread
+        event("aten::zeros", 95, 96, fill=7),
+        event("aten::before", -5, -4, fill=1000),
+        event("forward", 15, 400, where=on_gpu),
+    ]
+    expected = {"forward": 23e-6, "encoder": 100e-6, "backward": 200e-6, REST: 7e-6}
+    assert _by_kernels(events) == pytest.approx(expected)
+
+
 def test_writes_a_file_with_every_row(
     command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -353,7 +387,7 @@ def test_the_measurement_of_a_graph_begins_after_its_capture(monkeypatch: pytest
     real = Workload.train
 
     def noted(work: Workload) -> None:
-        steps.append(bool(work.update._graphs))
+        steps.append(work.update._graph is not None)
         real(work)
 
     monkeypatch.setattr(Workload, "train", noted)

@@ -88,6 +88,7 @@ class Replayed:
     """In place of `apex_lab.training.capture.Captured`."""
 
     def __init__(self, work: Callable[[Tensor], dict[str, Tensor]], given: Tensor, side: SideStream) -> None:
+        self.shape = given.shape
         self._given = given.clone()
         self._recorder = Recorder()
         with torch.random.fork_rng(devices=[]), NoCopies(), self._recorder:

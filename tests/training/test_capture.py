@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import contextlib
+import weakref
 from typing import Any
 
 import pytest
@@ -16,6 +17,7 @@ from torch.utils._pytree import tree_leaves
 
 from apex_lab.benchmark.work import Workload
 from apex_lab.training import update as updates
+from apex_lab.training.capture import SideStream
 from apex_lab.training.schedules import Constant, Linear
 from apex_lab.training.update import WARMUP, Mode, WeightUpdate, named_parameters, remember_rates
 from tests.conftest import TINY, compose_job, train_in
@@ -119,7 +121,7 @@ def layers(mode: Mode, captured: bool) -> list[float]:
     optimizer = remember_rates(torch.optim.RMSprop(named_parameters(made.model), lr=1e-2), captured)
     found = []
     for step in range(20):
-        shape = (4, 2, 3, 16, 16 if step < 12 else 12)  # a second graph
+        shape = (4, 2, 3, 16, 12 if 8 <= step < 15 else 16)  # a second graph, and the first shape's once more
         made(clips(torch.empty(shape), step), optimizer)
         found.append(made.latest["train/loss"].item())
     return found
@@ -128,6 +130,22 @@ def layers(mode: Mode, captured: bool) -> list[float]:
 @pytest.mark.usefixtures("replayed", "as_on_a_gpu")
 def test_twenty_steps_in_two_shapes() -> None:
     assert layers("cuda graph", captured=True) == pytest.approx(layers("eager", captured=False), rel=1e-5)
+
+
+@pytest.mark.usefixtures("as_on_a_gpu")
+def test_the_graph_of_one_shape_is_held_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    there: weakref.WeakSet[Replayed] = weakref.WeakSet()
+    others: list[int] = []
+
+    class Noted(Replayed):
+        def __init__(self, work: Any, given: Tensor, side: SideStream) -> None:
+            others.append(len(there))
+            super().__init__(work, given, side)
+            there.add(self)
+
+    monkeypatch.setattr(updates, "Captured", Noted)
+    layers("cuda graph", captured=True)
+    assert others == [0, 0, 0]  # three captures, each without another graph beside it
 
 
 @pytest.mark.usefixtures("replayed", "as_on_a_gpu")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from lightning.pytorch.strategies import SingleDeviceStrategy
 from torch import Tensor, nn
 from torch.optim import SGD, Adam, Optimizer, RMSprop
 
@@ -18,7 +21,21 @@ from apex_lab.training.composite import Composite
 from apex_lab.training.devices import _fused, set_matmul_precision
 from apex_lab.training.optimizers import Muon, all_orthogonalised
 from apex_lab.training.update import remember_rates
-from tests.conftest import compose_job
+from tests.conftest import Ended, compose_job
+from tests.test_train import without_speed
+
+class Elsewhere(Tensor):
+    """A tensor that NumPy cannot see, as on a GPU, and so is what is computed from it."""
+
+    def numpy(self, **_: Any) -> np.ndarray:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+    def __array__(self, *_: Any, **__: Any) -> np.ndarray:
+        raise TypeError("can't convert cuda:0 device type tensor to numpy")
+
+    def cpu(self, *_: Any, **__: Any) -> Tensor:
+        return self.as_subclass(Tensor)
+
 
 GPU, CPU = torch.device("cuda"), torch.device("cpu")
 
@@ -47,6 +64,25 @@ def test_products_of_a_gpu_are_as_asked_for(products: Callable[[], str], monkeyp
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda device: "a GPU")
     assert provenance.hardware(GPU)["matmul_precision"] == "high"  # in run.json
     assert "matmul_precision" not in provenance.hardware(CPU)
+
+
+@pytest.mark.parametrize("logger", ["csv", "tensorboard"])
+def test_batches_of_training_and_validation_may_lie_on_a_gpu(
+    logger: str, train: Callable[..., Ended], the_run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("trainer=cpu", "trainer.validation_interval=3", f"logger={logger}")
+    assert train(*words, "paths.outputs=plain").code == 0
+    real = SingleDeviceStrategy.batch_to_device
+
+    def moved(self: SingleDeviceStrategy, batch: Any, *args: Any, **kwargs: Any) -> Any:
+        batch = real(self, batch, *args, **kwargs)
+        return {key: x.as_subclass(Elsewhere) if isinstance(x, Tensor) else x for key, x in batch.items()}
+
+    monkeypatch.setattr(SingleDeviceStrategy, "batch_to_device", moved)
+    ended = train(*words)
+    assert ended.code == 0, ended.err
+    [plain] = Path("plain").glob("*/seed_0")
+    assert without_speed(the_run()) == without_speed(plain)
 
 
 def test_only_another_precision_is_another_run() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from functools import cache
 
 import pytest
@@ -13,7 +14,7 @@ import torch
 from apex_lab.training.capture import Captured, SideStream
 from apex_lab.training.optimizers import Muon
 from apex_lab.training.update import WARMUP
-from tests.conftest import REPOSITORY, compose_job
+from tests.conftest import REPOSITORY, TINY, Ended, compose_job
 from tests.training.losses import STEPS
 
 PRECISIONS = {
@@ -83,6 +84,19 @@ def test_a_replay_draws_what_its_seed_says() -> None:
         torch.manual_seed(seed)
         found = captured(given + seed)
         assert all(torch.equal(found[name], expected[name]) for name in expected)
+
+
+@pytest.mark.gpu
+@on_a_gpu
+@pytest.mark.parametrize("graph", [False, True])
+def test_a_whole_run(graph: bool, command: Callable[..., Ended]) -> None:
+    words = ("optimizer._target_=apex_lab.training.optimizers.Muon", "trainer=gpu", f"trainer.cuda_graph={graph}")
+    ended = command(
+        "train", *TINY, *words, "trainer.max_steps=12", "trainer.validation_interval=5", "logger=tensorboard"
+    )
+    assert ended.code == 0, ended.err
+    assert ended.out.count("validation:") == 3
+    assert "test: " in ended.out
 
 
 @pytest.mark.gpu

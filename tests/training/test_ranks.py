@@ -128,6 +128,26 @@ def test_callbacks_and_time_limits_stop_all_ranks_at_once(tmp_path: Path) -> Non
     assert not _workers(tmp_path)
 
 
+@pytest.mark.slow
+def test_ranks_look_together_at_what_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With values looked at two updates later, as on GPUs: rank 0 alone stores the second step, which is not finite."""
+    late = tmp_path / "late" / "sitecustomize.py"
+    late.parent.mkdir()
+    late.write_text(
+        "from apex_lab.training.watch import LAG, Watch\n"
+        "look = Watch.look\n"
+        "Watch.look = lambda self, lag=None: look(self, 0 if lag is None else LAG)\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(late.parent), os.environ["PYTHONPATH"]]))
+    broken = "loss.error={_target_: apex_lab.training.schedules.Linear, start: 1.0, end: 1e38, steps: 1}"
+    process = start(tmp_path, "trainer.devices=2", "trainer.log_interval=100", broken)
+    _, errors = process.communicate(timeout=200)
+    assert process.returncode == 1
+    assert "train/loss is inf at step 2 " in errors
+    assert list(tmp_path.glob("outputs/*/seed_0/diverged.npz"))
+    assert not list(tmp_path.glob("outputs/*/seed_0/checkpoints/*.ckpt"))
+
+
 def _workers(folder: Path) -> list[str]:
     """Processes of other ranks that were started in a folder."""
     found = []

@@ -131,9 +131,9 @@ def kernels(step: Callable[[], object]) -> dict[str, int]:
     with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as profiled:
         step()
         torch.cuda.synchronize()
-    events = list(profiled.events())
+    events, on_gpu = list(profiled.events()), torch.autograd.DeviceType.CUDA
     return {
-        "kernels": sum(event.device_type == torch.autograd.DeviceType.CUDA for event in events),
+        "kernels": sum(event.device_type == on_gpu and not event.is_user_annotation for event in events),
         "launches": sum("LaunchKernel" in event.name or "GraphLaunch" in event.name for event in events),
     }
 

@@ -149,7 +149,7 @@ def add_batch(
     """Predicts and scores one batch; returns the predictions."""
     found = list(predict(predictor, batch, scoring, onlookers))
     for b, predicted in enumerate(found):
-        tally.add(predicted, videos, batch["segmentation"][b].numpy() if videos.labelled else None)
+        tally.add(predicted, videos, batch["segmentation"][b].cpu().numpy() if videos.labelled else None)
     return found
 
 

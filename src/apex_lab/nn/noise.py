@@ -89,6 +89,7 @@ class VideoNoise(Noise):
     def at(self, frame: int, frames: int = 1) -> Noise:
         return _Frames(self, range(self._first_frame + frame, self._first_frame + frame + frames))
 
+    @torch.compiler.disable  # it would compile anew for the number of every video
     def _draw(self, draw: Draw, like: Tensor, frames: Sequence[int]) -> Tensor:
         """Rows of `like`: videos slowest, then `frames`, then what is left."""
         each = rows_each(like, len(self._videos) * len(frames))

@@ -110,7 +110,6 @@ class Checkpoints(L.Callback):
         }
 
     def _save_last(self, trainer: L.Trainer, learner: Learner) -> None:
-        learner.check_finite()
         seconds = self._seconds_before + time.monotonic() - self._start
         training = {
             "optimizer": learner.raw_optimizer().state_dict(),
@@ -153,19 +152,24 @@ def not_restored(what: str, error: Exception) -> str:
 
 
 class Lockstep(L.Callback):
-    """What every rank does alike: takes back the states of callbacks, and agrees on the step to stop at.
+    """What every rank does alike: takes back callbacks' states, agrees on the step to stop at, looks at what is stored.
 
     A request to stop that reaches any rank, and rank 0's clock, stop all ranks after the same step, and after the
-    validation that is due there. It stands behind the callbacks whose states it gives back.
+    validation that is due there. Before rank 0 stores a step, all ranks look whether every update up to it is finite:
+    they exchange what they saw, so rank 0 must not look alone. It stands behind the callbacks whose states it gives
+    back, and before `Checkpoints`.
 
     Args:
         states: of callbacks, by Lightning's name for each.
+        interval: steps between two checkpoints.
         max_steps: the last step; no time is up there.
         deadline: when time is up, by `time.monotonic`; None for never.
     """
 
-    def __init__(self, states: Mapping[str, Any], max_steps: int, deadline: float | None = None) -> None:
-        self._states, self._max_steps, self._deadline = states, max_steps, deadline
+    def __init__(
+        self, states: Mapping[str, Any], interval: int, max_steps: int, deadline: float | None = None
+    ) -> None:
+        self._states, self._interval, self._max_steps, self._deadline = states, interval, max_steps, deadline
 
     def setup(self, trainer: L.Trainer, learner: L.LightningModule, stage: str) -> None:
         for callback in _others(trainer, self):
@@ -176,13 +180,20 @@ class Lockstep(L.Callback):
                     raise UserError(not_restored(f"the state of {callback.state_key}", error)) from error
 
     def on_train_batch_end(self, trainer: L.Trainer, learner: L.LightningModule, *_: Any) -> None:
+        assert isinstance(learner, Learner)
         self._agree(trainer, learner)
+        if learner.stop is not None or learner.step % self._interval == 0:
+            learner.check_finite()
 
     def on_validation_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
+        assert isinstance(learner, Learner)
         self._agree(trainer, learner)
 
-    def _agree(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
+    def on_train_end(self, trainer: L.Trainer, learner: L.LightningModule) -> None:
         assert isinstance(learner, Learner)
+        learner.check_finite()
+
+    def _agree(self, trainer: L.Trainer, learner: Learner) -> None:
         if learner.stop is not None:
             return
         signum = interrupts.asked()

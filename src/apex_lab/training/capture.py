@@ -57,6 +57,7 @@ class Captured:
     """
 
     def __init__(self, work: Work, given: Tensor, side: SideStream) -> None:
+        self.shape = given.shape
         self._given = given.clone()
         self._graph = torch.cuda.CUDAGraph()
         # other threads may use the device meanwhile, such as the one that pins the memory of batches

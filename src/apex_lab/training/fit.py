@@ -83,7 +83,12 @@ def fit(
     every = [
         LastValidation(settings.max_steps),
         *callbacks,
-        Lockstep(training.get("callbacks", {}) if training else {}, settings.max_steps, deadline),
+        Lockstep(
+            training.get("callbacks", {}) if training else {},
+            settings.checkpoint_interval,
+            settings.max_steps,
+            deadline,
+        ),
         *([keep] if keep is not None else []),
     ]
     trainer = _trainer(config, update, device, ranks, every, loggers, folder)

@@ -96,7 +96,7 @@ class WeightUpdate(nn.Module):
         self.clip_norm = math.inf if clip_norm is None else clip_norm
         self.captured = mode in CAPTURED
         self.latest: dict[str, Tensor] = {}
-        self._graphs: dict[torch.Size, Captured] = {}
+        self._graph: Captured | None = None
         self._made: dict[torch.Size, int] = {}
         self._side: SideStream | None = None
         if mode.startswith("compiled"):
@@ -163,13 +163,15 @@ class WeightUpdate(nn.Module):
         self._side = self._side or SideStream(video.device)
         made = self._made.get(video.shape, 0)
         self._made[video.shape] = made + 1
+        if self._graph is not None and self._graph.shape != video.shape:
+            self._graph, self.latest = None, {}  # a device holds the memory of one shape, not of a whole staircase
         if made < WARMUP:
             with self._side.ordered():
                 return work(video)
-        if video.shape not in self._graphs:
+        if self._graph is None:
             optimizer.zero_grad(set_to_none=True)
-            self._graphs[video.shape] = Captured(work, video, self._side)
-        return self._graphs[video.shape](video)
+            self._graph = Captured(work, video, self._side)
+        return self._graph(video)
 
     def _work(
         self,
