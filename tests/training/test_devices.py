@@ -24,6 +24,7 @@ from apex_lab.training.update import remember_rates
 from tests.conftest import Ended, compose_job
 from tests.test_train import without_speed
 
+
 class Elsewhere(Tensor):
     """A tensor that NumPy cannot see, as on a GPU, and so is what is computed from it."""
 

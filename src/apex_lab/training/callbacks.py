@@ -166,9 +166,7 @@ class Lockstep(L.Callback):
         deadline: when time is up, by `time.monotonic`; None for never.
     """
 
-    def __init__(
-        self, states: Mapping[str, Any], interval: int, max_steps: int, deadline: float | None = None
-    ) -> None:
+    def __init__(self, states: Mapping[str, Any], interval: int, max_steps: int, deadline: float | None = None) -> None:
         self._states, self._interval, self._max_steps, self._deadline = states, interval, max_steps, deadline
 
     def setup(self, trainer: L.Trainer, learner: L.LightningModule, stage: str) -> None:
