@@ -152,6 +152,13 @@ def test_choices_that_a_pattern_names(train: Callable[..., Ended], tmp_path: Pat
     refused(train("model=glob(tin*)", "seed=x", "-m"), "seed = 'x' is wrong", tmp_path)  # in the folder of --config-dir
 
 
+def test_data_that_a_recipe_has_no_settings_for(command: Callable[..., Ended], tmp_path: Path) -> None:
+    told = (
+        "recipe/gswm/cpu_for has no file for data=video: take another data set's, such as recipe/gswm/cpu_for=p2d, of"
+    )
+    refused(command("train", "model=gswm", "data=video", "data.path=.", "scale=cpu"), told, tmp_path)
+
+
 def test_shell_completion_of_one_shell(command: Callable[..., Ended], tmp_path: Path) -> None:
     for words in ((), ("x",), ("install=nix",), ("install=bash", "seed=1")):
         refused(command("train", "--shell-completion", *words), "goes with one word alone: install=bash,", tmp_path)

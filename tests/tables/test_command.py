@@ -12,7 +12,7 @@ import pytest
 
 from apex_lab.runs.listed import Listed, listed
 from apex_lab.tables.asked import asked, read_tables
-from tests.conftest import Ended
+from tests.conftest import TINY, Ended
 from tests.tables.folders import run_folder
 
 
@@ -53,6 +53,19 @@ def test_a_sweep_names_its_tables(words: tuple[str, ...], numbers: list[str], ta
     ended = tables(*words, "dry_run=true")
     assert (ended.code, ended.err) == (0, "")
     assert [row.removeprefix("## Table ") for row in ended.out.splitlines() if row.startswith("## Table")] == numbers
+
+
+def test_without_a_sweep_a_model_chooses_among_the_papers_runs(tables: Callable[..., Ended], tmp_path: Path) -> None:
+    ended = tables("model=op3,one_segment", "scale=cpu")
+    assert (ended.code, ended.err) == (0, "")
+    trained = [line.split()[3] for line in ended.out.splitlines() if line.startswith("python -m apex_lab.train")]
+    assert trained == ["model=op3", "model=one_segment"]  # and no command that runs the whole sweep
+    assert (tmp_path / "outputs" / "tables" / "paper_op3_one_segment_p2d_cpu" / "table_1.csv").exists()
+
+
+def test_a_model_that_the_paper_does_not_have_is_taken_as_it_is_given(tables: Callable[..., Ended]) -> None:
+    ended = tables("model=tiny", "data=squares", "scale=smoke", *TINY[:2], "dry_run=true")
+    assert ended.err == "None of these jobs has a row in a table: model=tiny data=squares scale=smoke.\n"
 
 
 @pytest.fixture

@@ -332,6 +332,13 @@ def told(error: Exception, overrides: Sequence[str]) -> str:
             return f"tuned={word}: no study has written its values here; docs/tuning.md says how one does."
         if group == "hydra/launcher" and word in EXTRAS:
             return f"{group}={word} needs a package that is not installed: pip install 'apex-lab[{EXTRAS[word]}]'."
+        part = group.rpartition("/")[2]
+        if part.endswith("_for") and error.options:
+            other = "p2d" if "p2d" in error.options else error.options[0]
+            return (
+                f"{group} has no file for data={word}: take another data set's, such as {group}={other}, of "
+                f"{', '.join(error.options)}."
+            )
         guess = did_you_mean(word, error.options)
         return sentence(f"{group}={word}: there is no such choice in {', '.join(error.options)}{guess}")
     several = re.match(r"Ambiguous value for argument '([^=']+)=([^']*)'", text)

@@ -9,9 +9,12 @@ from typing import Any
 import torch
 from torch.utils.data import DataLoader
 
+from recordings import cores
+
 
 def options(workers: int) -> dict[str, Any]:
-    """Of a `DataLoader` with so many processes; zero: it loads in this one."""
+    """Of a `DataLoader` with so many processes, at most one on each core; zero: it loads in this one."""
+    workers = min(workers, cores())  # a job of a sweep may have one core
     return {
         "num_workers": workers,
         "persistent_workers": workers > 0,

@@ -2,6 +2,7 @@
 
 python -m apex_lab.tables +sweep=ablations scale=cpu   the table of a sweep: a row is a configuration of its jobs
 python -m apex_lab.tables                              all tables, from the runs of +sweep=paper
+python -m apex_lab.tables model=op3 scale=cpu          those of its runs that are of one model, or of several
 python -m apex_lab.tables scale=cpu tables=[1,3]       keys of its own: conf/tables.yaml; all other words name jobs
 """
 
@@ -63,6 +64,7 @@ class Tables:
         numbers: of the tables that the sweep makes; None: of all that have rows and are made from scores.
         specification: of the tables.
         config_dir: a further folder of configuration files.
+        whole: the jobs are all that the words make, not those of some models.
     """
 
     asked: TablesConfig
@@ -71,6 +73,7 @@ class Tables:
     numbers: tuple[int, ...] | None
     specification: spec.Specification
     config_dir: str | None = None
+    whole: bool = True
 
     @property
     def folder(self) -> Path:
@@ -81,7 +84,8 @@ class Tables:
         asked = {_key(word) for word in self.words}  # what a sweep changes by itself is known by its name
         changed = (word.lstrip("+") for job in self.jobs for word in job.changes)
         changes = list(dict.fromkeys(word for word in changed if _key(word) in asked))
-        words = "_".join([*sweeps(self.words), *named, *changes])
+        models = [] if self.whole else dict.fromkeys(job.choices["model"] for job in self.jobs)
+        words = "_".join([*sweeps(self.words), *models, *named, *changes])
         outputs = str(self.jobs[0].raw["paths"]["outputs"])
         return Path(outputs) / "tables" / re.sub(r"[^\w.=,+-]+", "-", words)[:150]
 
@@ -146,11 +150,10 @@ def asked(words: Sequence[str], config_dir: str | None = None) -> Tables:
     with composing(own):
         settings = validate(TablesConfig, plain(compose("tables", overrides=own)), "")
         assert isinstance(settings, TablesConfig)
-        rest = rest if sweeps(rest) else [EVERYTHING, *rest]
     specification = spec.load()
     check_numbers(settings, specification)
     try:
-        jobs = listed(rest, config_dir)
+        rest, jobs, whole = _jobs(rest, config_dir)
     except UserError:
         _refuse_misspelt(rest)
         raise
@@ -159,9 +162,22 @@ def asked(words: Sequence[str], config_dir: str | None = None) -> Tables:
         if model not in models:
             raise UserError(f"exclude_failed: there is no model '{model}' in {', '.join(models)}.")
     found = settings.tables or preflight.sweep_tables(rest, config_dir)
-    return Tables(
-        settings, tuple(rest), tuple(jobs), None if found is None else tuple(found), specification, config_dir
-    )
+    numbers = None if found is None else tuple(found)
+    return Tables(settings, tuple(rest), tuple(jobs), numbers, specification, config_dir, whole)
+
+
+def _jobs(words: list[str], config_dir: str | None) -> tuple[list[str], list[Listed], bool]:
+    """The words with a sweep, its jobs, and whether they are all: without a sweep a model chooses among the paper's."""
+    if sweeps(words):
+        return words, listed(words, config_dir), True
+    chosen = [word for word in words if _key(word) == "model"]
+    names = {name for word in chosen for name in word.partition("=")[2].split(",")}
+    jobs = listed([EVERYTHING, *(word for word in words if word not in chosen)], config_dir)
+    if not chosen:
+        return [EVERYTHING, *words], jobs, True
+    if not names <= {job.choices["model"] for job in jobs}:  # a model that the paper does not have
+        return words, listed(words, config_dir), True
+    return [EVERYTHING, *words], [job for job in jobs if job.choices["model"] in names], False
 
 
 def check_numbers(settings: TablesConfig, specification: spec.Specification) -> None:
@@ -207,7 +223,7 @@ def assemble(job: Tables) -> Made:
     if not tables:
         raise UserError(f"None of these jobs has a row in a table: {' '.join(job.words)}.")
     all_shown = {line.configuration.name for table in tables for line in table.lines} == {row.name for row in rows}
-    words = job.words if all_shown else None
+    words = job.words if all_shown and job.whole else None
     commands = missing_runs(tables, words, job.asked.exclude_failed, job.config_dir)
     return Made(tuple(tables), tuple(commands))
 

@@ -114,7 +114,7 @@ class Apex(SceneModel):
         start_presence: Share = 0.1,
         start_mask: float = 0.0,
         start_std: Positive = 0.5,
-        merges: Annotated[int, Field(ge=0)] = 0,
+        merges: Annotated[int, Field(ge=0, le=64)] = 0,
         piece_price: Annotated[float, Field(ge=0)] = 0.0,
         hollow_price: Annotated[float, Field(ge=0)] = 0.0,
         pixel_features: Annotated[int, Field(ge=0)] = 0,
