@@ -153,9 +153,7 @@ def test_choices_that_a_pattern_names(train: Callable[..., Ended], tmp_path: Pat
 
 
 def test_data_that_a_recipe_has_no_settings_for(command: Callable[..., Ended], tmp_path: Path) -> None:
-    told = (
-        "recipe/gswm/cpu_for has no file for data=video: take another data set's, such as recipe/gswm/cpu_for=p2d, of"
-    )
+    told = "recipe/gswm/cpu_for has no file for data=video: take another data set's, such as recipe/gswm/cpu_for=p2d,"
     refused(command("train", "model=gswm", "data=video", "data.path=.", "scale=cpu"), told, tmp_path)
 
 
