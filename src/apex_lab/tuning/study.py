@@ -36,7 +36,7 @@ class Study:
 
     Attributes:
         asked: the study's own keys.
-        word: study.name, else what `+study=` chose, else "study"; the tuned file is called so.
+        word: study.name, else what `+study=` chose, else "study".
         named: whether one of the first two.
         words: fixed overrides of every trial.
         own: how the study's file sets keys that it does not vary, without what the command line replaced.
@@ -75,6 +75,11 @@ class Study:
         groups = ("model", "ablation", "tuned", "data", "scale")
         named = [self.word, *(self.base.choices[group] for group in groups if group in self.base.choices)]
         return f"{'_'.join(named)}_{hashlib.sha256(canonical.encode()).hexdigest()[:8]}"
+
+    @property
+    def tuned(self) -> str:
+        """What `+tuned=` calls its values: its own name, which no shipped file has (a dot would end the word)."""
+        return self.name.replace(".", "_")
 
     @property
     def folder(self) -> Path:
