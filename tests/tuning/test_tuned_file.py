@@ -185,3 +185,9 @@ def test_the_values_of_another_model_are_refused(name: str, of: str, model: str)
         f"+tuned={name} has values for model={of} ({REPOSITORY / 'conf' / 'tuned' / name}.yaml), and this run has "
         f"model={model}: leave out +tuned={name}, or choose model={of}."
     )
+
+
+def test_a_model_without_training_has_nothing_to_tune(check: Callable[..., Study]) -> None:
+    for word in ("optimizer.lr=interval(1e-4,1e-2)", "model.components=choice(2,3)"):
+        with pytest.raises(UserError, match=r"^model=oracle is not trained, so nothing can be pruned or tuned\.$"):
+            check("scale=smoke", "model=oracle", word)
