@@ -21,6 +21,7 @@ from apex_lab.config.job import Job
 from apex_lab.train import train
 from apex_lab.training import ranks
 from apex_lab.tuning.study import Study, check_study, is_of_study
+from apex_lab.tuning.tuned_file import refuse_taken
 from apex_lab.tuning.workers import tune
 
 
@@ -40,7 +41,9 @@ def main() -> None:
 
     def check(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str]) -> Study:
         if not checked:
-            checked.append(check_study(words, config_dir, raw, choices))
+            study = check_study(words, config_dir, raw, choices)
+            refuse_taken(study)
+            checked.append(study)
         return checked[0]
 
     cli.launch(cli.Command("tune", check, lambda study: tune(study, _train), lambda study: study.name))

@@ -158,7 +158,9 @@ def test_unsupervised_maximises_the_elbo(
         assert trial.values == pytest.approx([elbo])
         config = yaml.safe_load((Path(trial.user_attrs["folders"][0]) / "config.yaml").read_text())
         assert config["schedule"]["sigma_fg_scale"]["start"] == 1.0
-    tuned = yaml.safe_load((tmp_path / "conf" / "tuned" / "sigma.yaml").read_text())
+    (file,) = (tmp_path / "conf" / "tuned").iterdir()
+    assert file.stem == the_study().study_name
+    tuned = yaml.safe_load(file.read_text())
     assert tuned["schedule"] == {name: {"start": 1.0, "end": 1.0} for name in ("sigma_fg_scale", "sigma_bg_scale")}
     assert set(tuned["model"]["likelihood"]) == {"sigma_fg", "sigma_bg"}
 
@@ -211,7 +213,9 @@ def test_another_study_of_the_same_name_is_refused_and_its_tuned_file_stays(
     file = tmp_path / "conf" / "tuned" / "mine.yaml"
     before = file.read_text()
     file.write_text(before.replace("# Study: mine", "# Study: other"))
-    assert "is of the study other and stays" in tune(SWEPT[0], *words).err
+    ended = tune(SWEPT[0], *words)
+    assert ended.code == 2
+    assert "mine.yaml is there already, and +tuned=mine would take it in place of what this study finds" in ended.err
     assert "# Study: other" in file.read_text()
 
 

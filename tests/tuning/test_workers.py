@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import time
@@ -17,6 +18,7 @@ from omegaconf import OmegaConf
 from optuna.trial import TrialState
 
 from apex_lab.base.errors import UserError
+from apex_lab.base.files import unwritable
 from apex_lab.base.interrupts import Interrupted
 from apex_lab.config.composition import conf_dir, plain
 from apex_lab.config.job import Job
@@ -26,7 +28,7 @@ from apex_lab.tuning import workers
 from apex_lab.tuning.settings import check_settings
 from apex_lab.tuning.storage import GRACE, Journal, shown_url
 from apex_lab.tuning.study import Study, check_study
-from apex_lab.tuning.trials import BEGUN, RETRY_OF, SURPLUS, places
+from apex_lab.tuning.trials import BEGUN, RETRIES, RETRY_OF, SURPLUS, places
 from apex_lab.tuning.workers import Worker
 from tests.conftest import TINY
 
@@ -99,6 +101,61 @@ def test_an_interrupted_trial_waits_for_the_next_worker(studies: Callable[..., S
     assert [trial.state for trial in trials] == [TrialState.FAIL, *[TrialState.COMPLETE] * 2]
     assert trials[1].params == trials[0].params
     assert trials[1].user_attrs["folders"] == trials[0].user_attrs["folders"]  # so its run resumes
+
+
+@pytest.mark.parametrize(("number", "told"), [(errno.ENOSPC, True), (errno.EDQUOT, False), (errno.EROFS, True)])
+def test_a_full_disk_ends_the_worker_and_the_trial_waits(
+    number: int, told: bool, studies: Callable[..., Study], tmp_path: Path
+) -> None:
+    """As a run tells it, or as the system says it; every further trial would fail for the same reason."""
+    study = studies(LR, "study.trials=2")
+    calls = 0
+
+    def full(job: Job, callbacks: list[L.Callback], command: str) -> None:
+        nonlocal calls
+        calls += 1
+        try:
+            raise OSError(number, os.strerror(number), str(tmp_path / "last.ckpt"))
+        except OSError as error:
+            if told:
+                raise unwritable(tmp_path / "last.ckpt", error) from error
+            raise
+
+    with pytest.raises(UserError, match=r"^Trial 0 waits: .*/last\.ckpt .*\.$"):
+        Worker(study, full).work()
+    assert calls == 1
+    first, again = _study_of(study).get_trials()
+    assert (first.state, again.state) == (TrialState.FAIL, TrialState.WAITING)
+    assert (again.user_attrs[RETRY_OF], again.user_attrs[RETRIES]) == (0, 0)
+    assert Worker(study, finish).work()
+    trials = _study_of(study).get_trials()
+    assert [trial.state for trial in trials] == [TrialState.FAIL, *[TrialState.COMPLETE] * 2]
+    assert trials[1].params == trials[0].params
+
+
+def test_a_disk_that_takes_half_of_it_uses_up_no_place(
+    studies: Callable[..., Study], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The trial can be put back, but not be recorded as over: its heartbeat ends it, and it is put back once."""
+    study = studies(LR, "study.trials=1")
+    worker = Worker(study, finish)
+
+    def full(*_: object, **__: object) -> None:
+        raise unwritable(study.folder / "journal.log", OSError(errno.ENOSPC, "No space left on device"))
+
+    def stopped(job: Job, callbacks: list[L.Callback], command: str) -> None:
+        monkeypatch.setattr(worker._optuna, "tell", full)
+        raise Interrupted(15)
+
+    worker._train = stopped
+    with pytest.raises(UserError, match="No space left"):
+        worker.work()
+    first, again = _study_of(study).get_trials()
+    assert (first.state, again.state) == (TrialState.RUNNING, TrialState.WAITING)
+    alive = study.folder / "journal.log.alive" / str(first._trial_id)
+    os.utime(alive, (time.time() - GRACE - 60,) * 2)
+    assert Worker(study, finish).work()
+    assert [trial.state for trial in _study_of(study).get_trials()] == [TrialState.FAIL, TrialState.COMPLETE]
 
 
 @pytest.mark.slow

@@ -154,6 +154,18 @@ def is_full(error: OSError) -> bool:
     return error.errno in FULL or os.strerror(errno.ENOSPC) in str(error)
 
 
+def takes_no_writes(error: BaseException | None) -> bool:
+    """Whether an exception, or one that it came from, is of a disk that is full or cannot be written at all.
+
+    Then nothing is wrong with the work at hand, and whatever comes next would fail as well.
+    """
+    while error is not None:
+        if isinstance(error, OSError) and (is_full(error) or error.errno == errno.EROFS):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
+
+
 def unwritable(path: Path, error: OSError) -> UserError:
     """The sentence for a file that could not be written."""
     if is_full(error):

@@ -272,17 +272,27 @@ def folder_of_runs(value: object) -> Path:
 
 
 def _check_tuned(choices: Mapping[str, str], runtime: Any) -> None:
-    """Refuses a file of `+tuned=<name>` that does more than set values; such files are passed on.
+    """Refuses a file of `+tuned=<name>` that does more than set values, since such files are passed on.
 
     Raises:
-        UserError: what it may not hold.
+        UserError: what it may not hold, another model that it is of, or a second file of its name.
     """
     if "tuned" not in choices:
         return
+    name, found = choices["tuned"], ""
     folders = [Path(source.path) for source in runtime.config_sources if source.schema == "file"]
-    for file in (folder / "tuned" / f"{choices['tuned']}.yaml" for folder in folders):
+    for file in (folder / "tuned" / f"{name}.yaml" for folder in folders):
         if file.is_file():
             text = file.read_text(encoding="utf-8")
+            if found not in ("", text):
+                raise UserError(f"+tuned={name} takes another file than {file}, which has its name: rename that one.")
+            found = text
+            of = re.search(rf"^{re.escape(OF_LINE)}model=(\S+)", text, re.MULTILINE)
+            if of is not None and of[1] != choices.get("model", of[1]):
+                raise UserError(
+                    f"+tuned={name} has values for model={of[1]} ({file}), and this run has model={choices['model']}: "
+                    f"leave out +tuned={name}, or choose model={of[1]}."
+                )
             for package in _PACKAGE.findall(text):
                 if package != "_global_":
                     raise UserError(f"{file} may not be put at {package}: write # @package _global_ and whole keys.")
@@ -290,6 +300,9 @@ def _check_tuned(choices: Mapping[str, str], runtime: Any) -> None:
             trust.only_values(content, str(file))
             _check_shipped(content, folders, str(file))
 
+
+OF_LINE = "# Of: python -m apex_lab.train "
+"""Start of the line of a tuned file that says what was tuned."""
 
 _PACKAGE = re.compile(r"^\s*#\s*@package\s+(\S+)", re.MULTILINE)
 

@@ -20,6 +20,7 @@ from apex_lab.config.composition import CHOICES
 from apex_lab.config.job import Job, check_job
 from apex_lab.config.upgrades import EXCLUDED, fingerprint
 from apex_lab.runs.folder import run_folder
+from apex_lab.scene import SceneModel
 from apex_lab.tuning.settings import ELBO, TuneConfig, check_settings
 from apex_lab.tuning.space import Parameter, Value, read
 
@@ -36,7 +37,7 @@ class Study:
 
     Attributes:
         asked: the study's own keys.
-        word: study.name, else what `+study=` chose, else "study"; the tuned file is called so.
+        word: study.name, else what `+study=` chose, else "study".
         named: whether one of the first two.
         words: fixed overrides of every trial.
         own: how the study's file sets keys that it does not vary, without what the command line replaced.
@@ -75,6 +76,11 @@ class Study:
         groups = ("model", "ablation", "tuned", "data", "scale")
         named = [self.word, *(self.base.choices[group] for group in groups if group in self.base.choices)]
         return f"{'_'.join(named)}_{hashlib.sha256(canonical.encode()).hexdigest()[:8]}"
+
+    @property
+    def tuned(self) -> str:
+        """What `+tuned=` calls its values: its own name, which no shipped file has (a dot would end the word)."""
+        return self.name.replace(".", "_")
 
     @property
     def folder(self) -> Path:
@@ -131,6 +137,9 @@ def check_study(
     asked = check_settings(raw)
     fixed, parameters = read([*OF_TRIALS, *asked.study.overrides, *train_words])
     _refuse(fixed, parameters)
+    recipe = _without(fixed)
+    if recipe is not None:
+        _refuse_untrained(recipe)
     first = {p.key: p.samples()[0] for p in parameters}
     own = [word for word in fixed if word in asked.study.overrides]
     word = asked.study.name or choices.get("study")
@@ -142,7 +151,7 @@ def check_study(
         own=tuple(own),
         parameters=tuple(parameters),
         base=_job([*fixed, *(p.word(first[p.key]) for p in parameters), f"seed={asked.study.seeds[0]}"]),
-        recipe=_recipe(fixed, parameters),
+        recipe=_recipe(recipe, parameters),
         config_dir=config_dir,
     )
     study = replace(unnamed, asked=_with_outputs(asked, unnamed.base))
@@ -164,11 +173,25 @@ def _with_outputs(asked: TuneConfig, base: Job) -> TuneConfig:
     return asked.model_copy(update={"paths": base.config.paths})
 
 
-def _recipe(fixed: Sequence[str], parameters: Sequence[Parameter]) -> dict[str, Value]:
-    """The values that a run without the swept words has, where the space holds them."""
+def _without(fixed: Sequence[str]) -> Job | None:
+    """The run without the swept words; None where it needs one of them."""
     try:
-        job = _job(fixed)
-    except UserError:  # it needs one of the swept words
+        return _job(fixed)
+    except UserError:
+        return None
+
+
+def _refuse_untrained(job: Job) -> SceneModel:
+    """A study of a model without training would have nothing to do; the model of one that has."""
+    model = build_model(job.config)
+    if not model.needs_training:
+        raise UserError(f"model={job.choices.get('model')} is not trained, so nothing can be pruned or tuned.")
+    return model
+
+
+def _recipe(job: Job | None, parameters: Sequence[Parameter]) -> dict[str, Value]:
+    """The values that a run without the swept words has, where the space holds them."""
+    if job is None:
         return {}
     found: dict[str, Value] = {}
     for p in parameters:
@@ -214,9 +237,7 @@ def _check_base(study: Study) -> None:
         raise UserError(
             f"trainer.max_minutes = {minutes:g} would end trials early: write study.max_minutes={minutes:g}."
         )
-    model = build_model(job.config)
-    if not model.needs_training:
-        raise UserError(f"model={job.choices.get('model')} is not trained, so nothing can be pruned or tuned.")
+    model = _refuse_untrained(job)
     if ELBO in scores and "nll" not in model.term_names:
         raise UserError(
             f"study.objectives: model={job.choices.get('model')} has no likelihood (its loss terms are "

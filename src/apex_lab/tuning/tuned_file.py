@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from optuna.trial import FrozenTrial
 from apex_lab.base import console
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder, write_text
-from apex_lab.config.composition import CHOICES, conf_dir
+from apex_lab.config.composition import CHOICES, OF_LINE, conf_dir
 from apex_lab.tuning.study import Study
 
 STUDY_LINE = "# Study: "
@@ -21,9 +22,7 @@ STUDY_LINE = "# Study: "
 
 
 def write_tuned(study: Study, trial: FrozenTrial) -> list[Path]:
-    """Writes conf/tuned/<study>.yaml into the study's folder and, from a checkout, into the repository.
-
-    A file of the repository that another study has written is left as it is.
+    """Writes conf/tuned/<study>.yaml into the study's folder and where `apex_lab.train` looks, and says how to use it.
 
     Args:
         study: which.
@@ -31,26 +30,41 @@ def write_tuned(study: Study, trial: FrozenTrial) -> list[Path]:
 
     Returns:
         The files.
+
+    Raises:
+        UserError: another file has taken its name since the study began.
     """
-    text = tuned_text(study, trial)
-    own = study.folder / "conf" / "tuned" / f"{study.word}.yaml"
-    found = [own]
-    make_folder(own.parent)
-    write_text(own, text)
-    shared = _shared(study)
-    if shared is not None:
-        other = _study_of(shared)
-        if other in (None, study.name):
-            make_folder(shared.parent)
-            write_text(shared, text)
-            found.append(shared)
-        else:
-            console.warn(f"{shared} is of the study {other} and stays: remove it to get the values of this one there.")
+    text, folder = tuned_text(study, trial), _searched(study)
+    found = list(dict.fromkeys(conf / "tuned" / f"{study.tuned}.yaml" for conf in (study.folder / "conf", folder)))
     for path in found:
+        if path is found[-1]:
+            refuse_taken(study)
+        make_folder(path.parent)
+        write_text(path, text)
         console.say(str(path))
-    searched = "" if study.asked.study.conf is None and len(found) > 1 else f" --config-dir {found[-1].parent.parent}"
-    console.say(f"use them: python -m apex_lab.train {_choices(study)}+tuned={study.word}{searched}")
+    words = [*_choices(study), *_groups(study), f"+tuned={study.tuned}"]
+    words += ["--config-dir", str(folder)] if folder != conf_dir() else []
+    console.say(f"use them: {shlex.join(['python', '-m', 'apex_lab.train', *words])}")
+    if study.config_dir is not None and Path(study.config_dir).resolve() != folder.resolve():
+        console.say(f"before, put the files of {study.config_dir} there too: a command takes one --config-dir.")
     return found
+
+
+def refuse_taken(study: Study) -> None:
+    """Refuses a name by which `+tuned=` would find another file than the study's.
+
+    Raises:
+        UserError: there is one.
+    """
+    folder = _searched(study)
+    for conf in dict.fromkeys((conf_dir(), folder)):  # in this order they are searched
+        path = conf / "tuned" / f"{study.tuned}.yaml"
+        other = _study_of(path)
+        if other is not None and (other != study.name or conf != folder):
+            raise UserError(
+                f"{path} is there already, and +tuned={study.tuned} would take it in place of what this study finds: "
+                "choose another study.name."
+            )
 
 
 def tuned_text(study: Study, trial: FrozenTrial) -> str:
@@ -67,8 +81,8 @@ def tuned_text(study: Study, trial: FrozenTrial) -> str:
         f"{STUDY_LINE}{study.name}",
         f"# Trial {trial.number} of {study.asked.study.trials}, seeds {list(study.asked.study.seeds)}: {scores} "
         "(validation videos).",
-        f"# Of: python -m apex_lab.train {_choices(study)}{' '.join(_further(study))}".rstrip(),
-        "# Written by python -m apex_lab.tune; use it with +tuned=" + study.word,
+        f"{OF_LINE}{' '.join([*_choices(study), *_further(study)])}",
+        "# Written by python -m apex_lab.tune; use it with +tuned=" + study.tuned,
     ]
     groups: list[Any] = []
     values: dict[str, Any] = {}
@@ -98,24 +112,31 @@ def _further(study: Study) -> list[str]:
     return [w for w, key in keys.items() if key not in CHOICES and not key.startswith(("paths", "evaluation."))]
 
 
-def _choices(study: Study) -> str:
+def _groups(study: Study) -> list[str]:
+    """Those of them that choose parts of the model, without which the values may have no keys to go to."""
+    return [word for word in _further(study) if "/" in word.partition("=")[0]]
+
+
+def _choices(study: Study) -> list[str]:
+    """The words that choose what was tuned."""
     words = study.base.choices
-    named = [f"model={words['model']}"]
-    named += [f"+ablation={words['ablation']}"] if "ablation" in words else []
-    return " ".join([*named, f"data={words['data']}", f"scale={words['scale']}"]) + " "
+    plus = {"ablation": "+", "experiment": "+"}
+    groups = ("model", "ablation", "data", "scale", "experiment")
+    return [f"{plus.get(group, '')}{group}={words[group]}" for group in groups if group in words]
 
 
-def _shared(study: Study) -> Path | None:
-    """Where the file goes besides the study's folder.
+def _searched(study: Study) -> Path:
+    """The folder of configurations in which `+tuned=` finds the file.
 
-    `study.conf`, else, for a study with a name, the repository's conf/ in a checkout; an installed package is not
-    written to.
+    `study.conf`, else the folder given as `--config-dir`, where the trials' own files lie; else the repository's conf/
+    for a study with a name, in a checkout. An installed package is not written to: then it is in the study's folder.
     """
-    if study.asked.study.conf is not None:
-        return Path(study.asked.study.conf) / "tuned" / f"{study.word}.yaml"
+    given = study.asked.study.conf or study.config_dir
+    if given is not None:
+        return Path(given).resolve()
     folder = conf_dir()
     inside_package = Path(__file__).resolve().parent.parent in folder.parents
-    return None if inside_package or not study.named else folder / "tuned" / f"{study.word}.yaml"
+    return study.folder / "conf" if inside_package or not study.named else folder
 
 
 def _study_of(path: Path) -> str | None:

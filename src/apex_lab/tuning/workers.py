@@ -10,9 +10,9 @@ from typing import Any
 import optuna
 from optuna.trial import FrozenTrial, TrialState
 
-from apex_lab.base import console
+from apex_lab.base import console, faults
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import make_folder
+from apex_lab.base.files import make_folder, takes_no_writes
 from apex_lab.base.validation import one_line, shown
 from apex_lab.runs import provenance
 from apex_lab.tuning.plots import draw
@@ -21,7 +21,7 @@ from apex_lab.tuning.settings import ELBO
 from apex_lab.tuning.storage import GRACE, open_storage, shown_url
 from apex_lab.tuning.study import Study, labelled
 from apex_lab.tuning.trial import Train, objective
-from apex_lab.tuning.trials import BEGUN, REASON, SURPLUS, best, ended, is_surplus, places, run_again
+from apex_lab.tuning.trials import BEGUN, REASON, RETRY_OF, SURPLUS, best, ended, is_surplus, places, run_again
 from apex_lab.tuning.tuned_file import write_tuned
 
 POLL_SECONDS = 2.0
@@ -126,7 +126,11 @@ class Worker:
         return True
 
     def _one(self) -> None:
-        """One trial; what ends it early is recorded before it goes on to the caller."""
+        """One trial; what ends it early is recorded before it goes on to the caller.
+
+        Raises:
+            UserError: the disk is full; the trial waits, since all others would fail as well.
+        """
         began = time.monotonic()
         number: int | None = None
 
@@ -138,10 +142,12 @@ class Worker:
                 raise _Surplus
             try:
                 return objective(self._study, trial, self._train)
-            except (UserError, optuna.TrialPruned) as error:
-                trial.set_user_attr(REASON, str(error))
-                raise
             except Exception as error:
+                if takes_no_writes(error):
+                    raise _NoRoom(str(error) if isinstance(error, UserError) else faults.told(error)) from error
+                if isinstance(error, UserError | optuna.TrialPruned):
+                    trial.set_user_attr(REASON, str(error))
+                    raise
                 trial.set_user_attr(REASON, f"{type(error).__name__}: {one_line(error)}")
                 raise
 
@@ -150,9 +156,11 @@ class Worker:
         except optuna.exceptions.UpdateFinishedTrialError:
             console.warn(f"trial {number}: its heartbeats came too late, so another worker has taken it over.")
             return
-        except BaseException:  # Ctrl-C, SIGTERM
+        except BaseException as stop:  # Ctrl-C, SIGTERM, a full disk
             if number is not None:
                 self._give_back(number)
+            if isinstance(stop, _NoRoom):
+                raise UserError(f"Trial {number} waits: {stop}") from stop
             raise
         found = next(t for t in self._trials() if t.number == number)
         if not found.user_attrs.get(SURPLUS):
@@ -162,11 +170,14 @@ class Worker:
         """Puts an interrupted trial back, for the next worker that asks."""
         trial = next(t for t in self._trials() if t.number == number)
         if trial.state == TrialState.RUNNING:
-            self._optuna.tell(number, state=TrialState.FAIL)
+            # in this order a disk that takes the first alone leaves no failed trial in the place
             run_again(self._optuna, trial, lost=False, most=self._asked.retries)
+            self._optuna.tell(number, state=TrialState.FAIL)
 
     def _lost(self, study: optuna.Study, trial: FrozenTrial) -> None:
         """Called by Optuna with a trial whose heartbeat stopped."""
+        if any(t.user_attrs.get(RETRY_OF) == trial.number for t in study.get_trials(deepcopy=False)):
+            return  # its worker could still put it back
         again = run_again(study, trial, lost=True, most=self._asked.retries)
         then = "it is run again" if again else f"after study.retries = {self._asked.retries} it counts as failed"
         console.say(f"trial {trial.number}: its worker {trial.user_attrs.get(BEGUN, '')} is lost; {then}.")
@@ -218,6 +229,10 @@ class Worker:
 
 class _Surplus(Exception):
     """This trial has no place."""
+
+
+class _NoRoom(BaseException):
+    """The disk takes no writes; a BaseException, so that Optuna does not record a failed trial."""
 
 
 def _short(value: object) -> str:
