@@ -7,10 +7,12 @@ import re
 from pathlib import Path
 
 import pytest
+import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import (
     clear_drafts,
+    draft_of,
     make_folder,
     read_json,
     replacing,
@@ -74,6 +76,13 @@ def test_a_full_disk_is_told_with_its_free_space(tmp_path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
     with pytest.raises(OSError, match="elsewhere"), writing(tmp_path / "file"):
         raise OSError(errno.EIO, "elsewhere")
+
+
+def test_a_full_disk_is_told_when_torch_writes(tmp_path: Path) -> None:
+    draft_of(tmp_path / "state.pt").symlink_to("/dev/full")
+    with pytest.raises(UserError, match=r"No space left for .*/state\.pt"), replacing(tmp_path / "state.pt") as file:
+        torch.save([torch.zeros(20_000), torch.zeros(20_000)], file)
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_a_kill_left_of_a_file_is_removed(tmp_path: Path) -> None:

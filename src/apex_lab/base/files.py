@@ -60,6 +60,11 @@ def replacing(path: Path, keep: Path | None = None) -> Iterator[IO[bytes]]:
         _sync_folder(path.parent)
     except OSError as error:
         raise unwritable(path, error) from error
+    except RuntimeError as error:
+        # torch.save hides the operating system's error behind its own
+        if isinstance(error.__context__, OSError):
+            raise unwritable(path, error.__context__) from error
+        raise
     finally:
         with contextlib.suppress(OSError):  # a file system without write access says so before it looks for the file
             part.unlink(missing_ok=True)
