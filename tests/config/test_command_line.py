@@ -206,6 +206,9 @@ def test_home_folders_of_commands_that_read_runs(
     command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
+    ended = command("status", "--once", "paths.outputs=~/runs")
+    assert (ended.code, ended.out) == (0, "There are no runs.\n")
+    assert f"The folder {tmp_path}/runs (paths.outputs) does not exist." in " ".join(ended.err.split())
     (tmp_path / "runs").touch()
     ended = command("status", "--once", "paths.outputs=~/runs")
     assert f"paths.outputs = {tmp_path}/runs cannot be read (Not a directory)" in ended.err
