@@ -48,6 +48,18 @@ def test_of_many_videos_the_bad_ones_are_named_and_the_others_drawn(
     ]
 
 
+def test_videos_with_odd_names_are_drawn_under_these(command: Callable[..., Ended], tmp_path: Path) -> None:
+    names = ["2026-11-28T10:00:00", "a$b", "a,b=c d", "ok", "${ok}", "\\"]
+    (tmp_path / "odd").mkdir()
+    for name in [*names, "..dots"]:
+        shutil.copy(EXAMPLE, tmp_path / "odd" / f"{name}.mp4")
+    words = ("checkpoints=apex-p2d-cpu", "frames=2", "columns=1", "folder=cmp")
+    assert command("compare", *words, "video=odd").code == 0
+    assert sorted(path.name for path in (tmp_path / "cmp").iterdir()) == sorted(f"{name}.png" for name in names)
+    ended = command("compare", *words, "video=odd/..dots.mp4")
+    assert (ended.code, ended.out.splitlines()[0]) == (0, "cmp/dots.png")
+
+
 def test_clips_that_are_not_there_are_refused_before_any_is_drawn(
     command: Callable[..., Ended], tmp_path: Path
 ) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,7 +21,7 @@ import numpy as np
 from sims import arm as panda
 from sims.assets import object_models
 from sims.bullet import Client, load_pybullet_data
-from sims.errors import SimError
+from sims.command import ending
 from sims.objects import CATALOGUE
 from sims.p2d.settings import Settings
 from sims.p2d.simulate import simulate, steps_of
@@ -128,8 +129,8 @@ def measure(settings: Settings, trajectories: int) -> tuple[Clock, Clock]:
     return naive, product
 
 
-def main() -> None:
-    """Print the speeds, their ratio, and the time for the whole data set."""
+def main() -> int:
+    """Print the speeds, their ratio, and the time for the whole data set; returns the exit code."""
     parser = argparse.ArgumentParser(
         prog="python -m sims.p2d.bench_simulation", description=(__doc__ or "").split("\n\n")[0]
     )
@@ -137,11 +138,12 @@ def main() -> None:
     parser.add_argument("--image-size", type=int, default=128, help="side of the images in pixels (default 128)")
     parser.add_argument("--renderer", choices=["tiny", "egl"], default="tiny", help="renderer of P2D (default tiny)")
     words = parser.parse_args()
+    return ending(lambda: _run(words), "nothing is stored")
+
+
+def _run(words: argparse.Namespace) -> int:
     settings = Settings(image_size=words.image_size, renderer=words.renderer)
-    try:
-        naive, product = measure(settings, max(1, words.trajectories))
-    except SimError as error:
-        raise SystemExit(f"error: {error}") from error
+    naive, product = measure(settings, max(1, words.trajectories))
     print(f"{settings.image_size} x {settings.image_size}, {settings.frames} frames, {words.trajectories} trajectories")
     for name, clock in (("naive scene", naive), ("P2D", product)):
         wall = clock.frames / clock.wall_s
@@ -152,7 +154,8 @@ def main() -> None:
         print(
             f"whole P2D    {whole / product.per_core / cores / 60:6.1f} minutes for {whole} frames on {cores} core(s)"
         )
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -72,6 +72,8 @@ def looking(words: Sequence[str], config_dir: str | None = None) -> Callable[[],
     """
     if all(word.lstrip("+").startswith("paths.") for word in words):
         outputs = outputs_folder(words)
+        if words and not outputs.exists():
+            terminal.warn(f"The folder {outputs} (paths.outputs) does not exist.")
         last: list[Overview | None] = [None]
 
         def look() -> Overview:

@@ -5,8 +5,10 @@ import json
 import math
 import re
 from pathlib import Path
+from typing import IO
 
 import pytest
+import torch
 
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import (
@@ -74,6 +76,28 @@ def test_a_full_disk_is_told_with_its_free_space(tmp_path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
     with pytest.raises(OSError, match="elsewhere"), writing(tmp_path / "file"):
         raise OSError(errno.EIO, "elsewhere")
+
+
+class Filling:
+    """A file on a disk that has room for small pieces alone."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.file = file
+
+    def write(self, piece: bytes) -> int:
+        if len(piece) > 1000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return self.file.write(piece)
+
+
+def test_a_full_disk_is_told_when_torch_writes(tmp_path: Path) -> None:
+    def save() -> None:
+        with replacing(tmp_path / "state.pt") as file:
+            torch.save([torch.zeros(20_000)], Filling(file))  # type: ignore[arg-type]
+
+    with pytest.raises(UserError, match=r"No space left for .*/state\.pt"):
+        save()
+    assert not list(tmp_path.iterdir())
 
 
 def test_what_a_kill_left_of_a_file_is_removed(tmp_path: Path) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
-from apex_lab.config.options import at_home
+from apex_lab.config.options import arrange, at_home
 from tests.conftest import REPOSITORY, TINY, Ended
 
 REFUSED = {
@@ -208,6 +211,9 @@ def test_home_folders_of_commands_that_read_runs(
     command: Callable[..., Ended], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
+    ended = command("status", "--once", "paths.outputs=~/runs")
+    assert (ended.code, ended.out) == (0, "There are no runs.\n")
+    assert f"The folder {tmp_path}/runs (paths.outputs) does not exist." in " ".join(ended.err.split())
     (tmp_path / "runs").touch()
     ended = command("status", "--once", "paths.outputs=~/runs")
     assert f"paths.outputs = {tmp_path}/runs cannot be read (Not a directory)" in ended.err
@@ -236,6 +242,16 @@ def test_what_is_merged_is_told(train: Callable[..., Ended], tmp_path: Path) -> 
 def test_an_ablation_of_another_model_is_named(command: Callable[..., Ended], tmp_path: Path) -> None:
     told = "+ablation=no_entropy sets loss.mask_entropy, which model=oracle does not have: leave out the ablation"
     refused(command("train", "model=oracle", "data=sprites", "scale=smoke", "+ablation=no_entropy"), told, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "name", ["odd/${oc.env:HOME}.mp4", "a${b", "$${x}", "\\${a}", "a\\\\b ${x}, c", "it's ${x}'", "${x}\\", "a$b"]
+)
+def test_names_of_files_are_not_interpolated(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["predict", f"video={name}"])
+    arrange(literal=("video",))
+    override = OverridesParser.create().parse_override(sys.argv[1])
+    assert OmegaConf.to_container(OmegaConf.create({"video": override.value()}), resolve=True) == {"video": name}
 
 
 def test_a_path_that_needs_quotes(command: Callable[..., Ended], tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -212,6 +213,7 @@ BAD_WEIS: dict[str, tuple[Any, str]] = {
     "cut": ([[{"ids": [3], "masks": [{**RLE, "counts": "0P"}]}]], "no run-length encoding"),
     "list": ([[{"ids": [3], "masks": [{**RLE, "counts": [0, "a"]}]}]], "no run-length encoding"),
     "kind": ([[{"ids": [3], "masks": [7]}]], "no run-length encoding"),
+    "polygon": ([[{"ids": [3], "masks": [[[0, 0, 1, 0, 1, 1]]]}]], "polygons are not read, give run-length encodings"),
     "outside": ([[{"ids": [3], "masks": ["3 4"]}]], "a run of 4 pixels from 3 on does not lie in an image of 2 x 2"),
     "odd": ([[{"ids": [3], "masks": ["3"]}]], "'3' is no list of starts and lengths"),
 }
@@ -271,6 +273,21 @@ def test_malformed_pictures(tmp_path: Path) -> None:
     (tmp_path / "a" / "1.png").write_bytes(b"nothing")
     with pytest.raises(UserError, match="no readable PNG"):
         read_davis(tmp_path, "a")
+
+
+@pytest.mark.parametrize("score", ["high", math.nan, None, True])
+def test_a_score_that_is_no_number(tmp_path: Path, npz: Path, score: object) -> None:
+    path = export("coco", tmp_path / "p.json")
+    results = json.loads(path.read_text())
+    results[1]["score"] = score
+    path.write_text(json.dumps(results))
+    with pytest.raises(UserError, match=r"p\.json, result 1: score is .*; want a number"):
+        score_predictions(path, truth=npz)
+
+
+def test_a_file_for_a_format_of_folders(npz: Path) -> None:
+    with pytest.raises(UserError, match=r"format = davis wants a folder, and .*\.npz is a file"):
+        score_predictions(npz, format="davis")
 
 
 def test_ground_truth_of_no_kind(tmp_path: Path) -> None:

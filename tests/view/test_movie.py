@@ -14,9 +14,10 @@ import torch
 from PIL import Image
 
 from apex_lab.base.errors import UserError
-from apex_lab.view import Item, movie
+from apex_lab.view import Item, encoder, movie
 from apex_lab.view.canvas import GAP, MARGIN
 from apex_lab.view.colors import BACKGROUND_COLOR, color_of
+from apex_lab.view.encoder import Mp4
 from apex_lab.view.movie import _CAPTION, _HEADING
 from tests.view.scenes import FIRST, GREY, RED, H, T, W, item
 
@@ -145,3 +146,22 @@ def test_noise_survives_compression(tmp_path: Path) -> None:
     wanted = noise[0].permute(0, 2, 3, 1).float().mean(-1).numpy()
     shown = np.stack([[[at(frame, 0, y, x).mean() for x in range(W)] for y in range(H)] for frame in frames])
     assert np.abs(shown - wanted).mean() < 0.03 * 255
+
+
+def test_a_full_disk_is_one_sentence_without_words_of_ffmpeg(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "movie.mp4").symlink_to("/dev/full")
+    with pytest.raises(UserError, match=r"movie\.mp4 cannot be written: ffmpeg (wrote|ended)"):
+        write_noise(tmp_path / "movie.mp4")
+    monkeypatch.setattr(encoder, "TIGHT", 2**60)
+    with pytest.raises(UserError, match=r"No space left for .*movie\.mp4"):
+        write_noise(tmp_path / "movie.mp4")
+    assert capfd.readouterr() == ("", "")
+
+
+def write_noise(path: Path) -> None:
+    frames = np.random.default_rng(0).integers(0, 256, (60, 128, 128, 3), dtype=np.uint8)
+    with Mp4(path, (128, 128), fps=10.0) as film:
+        for frame in frames:
+            film.add(frame)

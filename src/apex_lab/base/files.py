@@ -60,6 +60,11 @@ def replacing(path: Path, keep: Path | None = None) -> Iterator[IO[bytes]]:
         _sync_folder(path.parent)
     except OSError as error:
         raise unwritable(path, error) from error
+    except RuntimeError as error:
+        # torch.save hides the operating system's error behind its own
+        if isinstance(error.__context__, OSError):
+            raise unwritable(path, error.__context__) from error
+        raise
     finally:
         with contextlib.suppress(OSError):  # a file system without write access says so before it looks for the file
             part.unlink(missing_ok=True)
@@ -76,8 +81,12 @@ def write_json(path: Path, content: object) -> None:
     write_text(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path, advice: str = "remove it and run the same command again") -> dict[str, Any]:
     """Reads a JSON object.
+
+    Args:
+        path: the file.
+        advice: what to do where it is damaged.
 
     Raises:
         UserError: it is missing or damaged.
@@ -85,9 +94,9 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        raise UserError(f"{path} cannot be read ({error}): remove it and run the same command again.") from error
+        raise UserError(f"{path} cannot be read ({error}): {advice}.") from error
     if not isinstance(content, dict):
-        raise UserError(f"{path} holds no JSON object: remove it and run the same command again.")
+        raise UserError(f"{path} holds no JSON object: {advice}.")
     return content
 
 

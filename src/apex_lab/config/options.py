@@ -122,8 +122,10 @@ def _quoted(word: str, literal: Sequence[str]) -> str:
     key, equals, value = word.partition("=")
     if key.lstrip("+") not in literal or not equals or value in ("", "null") or value[0] in "['\"":
         return word
-    # in quotes a backslash stands for itself, unless it comes before a quote or the end
-    escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), value)
+    # for OmegaConf a backslash stands for itself, unless it comes before an interpolation
+    plain = re.sub(r"(\\*)\$\{", r"\1\1\\${", value)
+    # in quotes it does, unless it comes before a quote or the end
+    escaped = re.sub(r"(\\*)('|$)", lambda m: m[1] * 2 + ("\\'" if m[2] else ""), plain)
     return f"{key}='{escaped}'"
 
 

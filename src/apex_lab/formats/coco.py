@@ -13,6 +13,7 @@ the reader makes one segment of all pixels without a mask.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
@@ -153,6 +154,9 @@ def _entry(entry: Any, where: str, truth: bool = False) -> tuple[int, int, Any]:
                 "the masks of each image and set scoring.identities=none)"
             )
         check_integer(value, f"{where}: {key}")
+    score = entry.get("score", 1.0)
+    if not truth and (type(score) not in (int, float) or not math.isfinite(score)):
+        raise UserError(f"{where}: score is {score!r}; want a number, or leave it out")
     if "segmentation" not in entry:
         raise UserError(f"{where}: the key segmentation is missing; boxes hold no masks and cannot be scored")
     return entry["image_id"], entry["track_id"], entry["segmentation"]

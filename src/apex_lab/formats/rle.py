@@ -46,6 +46,8 @@ def decode(mask: Any, size: tuple[int, int], where: str, size_of: str = "the gro
     """
     if isinstance(mask, str):
         return _from_runs(mask, size, where)
+    if isinstance(mask, list):
+        raise UserError(f"{where}: a mask is a list, as polygons are; polygons are not read, give run-length encodings")
     try:
         height, width = mask["size"]
         counts = mask["counts"]

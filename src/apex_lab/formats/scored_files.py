@@ -101,6 +101,8 @@ def _scored(
         raise UserError(f"format is {format!r}; choose one of {', '.join(get_args(Format))}")
     if resize not in (None, *get_args(Resize)):
         raise UserError(f"resize is {resize!r}; choose one of {', '.join(get_args(Resize))}, or leave it out")
+    if format in ("davis", "mots") and path.is_file():
+        raise UserError(f"format = {format} wants a folder, and {path} is a file; leave format out, or give the folder")
     if truth is not None:
         known = _Labels(open_truth(truth, split), str(truth), settings.ignore_label)
     elif format == "npz":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -16,7 +17,6 @@ from apex_lab.base import console, interrupts
 from apex_lab.base.errors import UserError
 from apex_lab.base.files import make_folder
 from apex_lab.data import VideoSet
-from apex_lab.formats.davis import plain_name
 from apex_lab.inference.predictor import Batch, Predictor
 from apex_lab.metrics.linking import link_frames
 from apex_lab.scene import Scene
@@ -138,8 +138,8 @@ def _background(scene: Scene, labels: np.ndarray) -> np.ndarray:
 
 
 def _file_name(name: str, before: Sequence[Path]) -> str:
-    """The clip's name; with a number, where two have the same."""
-    name = plain_name(name)
+    """The clip's name, as far as a file may have it; with a number, where two have the same."""
+    name = re.sub(r"[/\0]", "_", name).lstrip(".") or "video"
     taken = {path.stem for path in before}
     numbered = (name if n == 1 else f"{name}_{n}" for n in range(1, len(before) + 2))
     return next(each for each in numbered if each not in taken)

@@ -28,7 +28,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from apex_lab.base import faults
 from apex_lab.base.errors import UserError
-from apex_lab.base.files import replacing, unwritable
+from apex_lab.base.files import replacing
 from apex_lab.base.machine import bounded_memory
 from apex_lab.base.outlines import outline
 from apex_lab.base.validation import LARGEST, shown
@@ -76,13 +76,7 @@ def save(path: Path, checkpoint: dict[str, Any], keep_previous: bool = False) ->
     content = {"format": FORMAT, **checkpoint}
     assert set(content) == _KEYS[FORMAT]
     with replacing(path, keep=previous(path) if keep_previous else None) as file:
-        try:
-            torch.save(content, file)
-        except RuntimeError as error:
-            # torch's writer hides the operating system's error behind its own
-            if isinstance(error.__context__, OSError):
-                raise unwritable(path, error.__context__) from error
-            raise
+        torch.save(content, file)
 
 
 def holds(value: object) -> bool:

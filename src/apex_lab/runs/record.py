@@ -12,6 +12,9 @@ from apex_lab.base.errors import UserError
 from apex_lab.base.files import read_json
 from apex_lab.base.validation import LARGEST, validate
 
+ADVICE = "run the same command again, which sets it aside"
+"""What to do about a damaged record."""
+
 
 class Start(BaseModel):
     """One start of a run, an entry of its history."""
@@ -67,7 +70,7 @@ def read_record(file: Path) -> dict[str, Any]:
     Raises:
         UserError: it is missing or damaged, or an entry is not what it must be.
     """
-    content = read_json(file)
+    content = read_json(file, ADVICE)
     check(Record, content, file)
     return content
 
@@ -90,4 +93,4 @@ def check(schema: type[Kept], content: Mapping[str, Any], file: Path) -> None:
             validate(schema, content, "")
         except UserError as error:
             raise UserError(f"{file} is damaged: {error}") from error
-        raise UserError(f"{file} is damaged: remove it and run the same command again.") from None
+        raise UserError(f"{file} is damaged: {ADVICE}.") from None

@@ -94,7 +94,8 @@ def started(job: dict[str, Any], devices: int, nodes: int, folder: Path) -> Iter
     threads = {"OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", str(max(1, torch.get_num_threads() // devices)))}
     with tempfile.TemporaryDirectory(prefix="apex_lab_ranks_") as aside:
         file = Path(aside) / "job.pt"
-        torch.save(job, file)
+        with replacing(file) as opened:
+            torch.save(job, opened)
         workers: list[subprocess.Popen[bytes]] = []
         before = dict(os.environ)
         try:

@@ -80,7 +80,7 @@ class Mp4:
             pix_fmt_out="yuv420p",
             quality=None,
             macro_block_size=2,
-            ffmpeg_log_level="error",
+            ffmpeg_log_level="fatal",  # its errors are told below
             # the index in front, so that browsers start at once
             output_params=[*(quality if h264 else ("-q:v", "3")), "-movflags", "+faststart", "-threads", "1"],
         )
@@ -97,7 +97,7 @@ class Mp4:
         try:
             self._encoder.send(np.ascontiguousarray(frame))
         except OSError as error:
-            raise unwritable(self.path, error) from error
+            raise self._cut_off(f"ffmpeg ended after {self.written} frames") from error
         self.written += 1
 
     def __enter__(self) -> Mp4:
@@ -112,9 +112,11 @@ class Mp4:
         self._encoder.close()
         # ffmpeg may fail at its last write, when nobody listens any more
         if kind is None and (count := frames_of(self.path)) != self.written:
-            full = shutil.disk_usage(self.path.absolute().parent).free < TIGHT
-            number = errno.ENOSPC if full else errno.EIO
-            raise unwritable(self.path, OSError(number, f"ffmpeg wrote {count} of {self.written} frames"))
+            raise self._cut_off(f"ffmpeg wrote {count} of {self.written} frames")
+
+    def _cut_off(self, why: str) -> UserError:
+        full = shutil.disk_usage(self.path.absolute().parent).free < TIGHT
+        return unwritable(self.path, OSError(errno.ENOSPC, why) if full else OSError(why))
 
 
 def join(path: Path, parts: Sequence[Path], slower: float = 1.0) -> None:

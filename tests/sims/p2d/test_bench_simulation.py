@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 import pytest
@@ -16,10 +17,17 @@ def test_it_counts_frames_and_prints_the_ratio(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["bench", "--trajectories", "1", "--image-size", "32"])
-    bench.main()
+    assert bench.main() == 0
     said = capsys.readouterr().out
     assert "frames per second and core" in said
     assert "minutes for 48000 frames on 2 core(s)" in said
+
+
+def test_a_request_to_stop_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["bench"])
+    monkeypatch.setattr(bench, "measure", lambda *_: signal.raise_signal(signal.SIGTERM))
+    assert bench.main() == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "terminated; nothing is stored\n"
 
 
 @pytest.mark.slow
