@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from apex_lab.base.files import make_folder, unwritable
 from apex_lab.base.progress import Meter
 from apex_lab.base.validation import one_line, sentence
 from apex_lab.runs import provenance
+from recordings import cores
 
 MAX_FAILURES = 5
 """Scenarios without an outcome after which no further one is started."""
@@ -49,11 +49,6 @@ class Benchmark:
     again: bool
     base: Path
     into: Path | None
-
-
-def cores() -> int:
-    """Processor cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def run(asked: Benchmark) -> None:
