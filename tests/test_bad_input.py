@@ -1,4 +1,4 @@
-"""What is typed wrong after commands that use trained weights: one sentence, before anything is read or made."""
+"""What commands cannot be done with: one sentence, before anything is read or made."""
 
 from __future__ import annotations
 
@@ -37,6 +37,17 @@ REFUSED = {
     ("evaluate", "checkpoint=a***b"): "checkpoint = a***b is no pattern (Invalid pattern",
     ("evaluate", WEIGHTS, "data=sprites", "data.frames=100000000"): "frames of whole videos would take",
     ("evaluate", WEIGHTS, "--config-dir="): f"--config-dir = '' is wrong: {EMPTY}.",
+    # the sweep's first job could start, its second has no data
+    ("train", "seed=0,1", "data=p2d,sketchy", "-m"): "sketchy_demos_128px is not there: prepare it with python -m",
+    (
+        "train",
+        "seed=0,1",
+        "data=video",
+        "data.path=gone",
+        "scale=cpu",
+        "-m",
+    ): "data.path = gone does not exist: give a folder",
+    ("train", "data.generate=true,false", "-m"): "no finished P2D data at",
     ("tables", "+sweep=glob(*)"): "+sweep=glob(*) is a pattern, which fits files of a group alone: name the values.",
     ("tables", "tabels=[1]"): "Unknown key tabels=[1]; did you mean 'tables'?\n",
     ("status", "seed=range(1000000000)"): "seed=range(1000000000) holds more than 100,000 values: name fewer.",

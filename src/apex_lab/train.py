@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from apex_lab.config import command_line as cli
 from apex_lab.config import components, initial, trust
 from apex_lab.config.building import build_model, build_schedules
 from apex_lab.config.building import device as device_of
-from apex_lab.config.composition import CHOICES
+from apex_lab.config.composition import CHOICES, Composed
 from apex_lab.config.consistency import needs_labels
 from apex_lab.config.job import Job, check_job, reseeded
 from apex_lab.config.schema import InitialPart
@@ -55,7 +55,22 @@ from apex_lab.training.showing import Showing, closing
 
 def main() -> None:
     """Entry point: `python -m apex_lab.train`."""
-    cli.launch(cli.Command("train", check_job, train, title, known=_known, reseeded=reseeded))
+    cli.launch(cli.Command("train", _check, train, title, known=_known, reseeded=_reseeded))
+
+
+def _check(raw: dict[str, Any], choices: Mapping[str, str], overrides: Sequence[str]) -> Job:
+    return _with_data(check_job(raw, choices, overrides))
+
+
+def _reseeded(job: Job, made: Composed) -> Job:
+    return _with_data(reseeded(job, made))
+
+
+def _with_data(job: Job) -> Job:
+    """Refuses a job whose data only the user can bring, before any job of its sweep starts; scores need no data."""
+    if _known(job).state != "finished":
+        components.build(job.config.data, "data").refuse_missing()
+    return job
 
 
 def _known(job: Job) -> RunState:

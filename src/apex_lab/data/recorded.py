@@ -201,6 +201,18 @@ class RecordedSource(VideoSource):
         """The shell command that makes missing data."""
         return self.kind.make_command.format(root=self.folder)
 
+    def refuse_missing(self) -> None:
+        """Looks whether data that may not be made are there.
+
+        Raises:
+            UserError: they are not.
+        """
+        if not self.generate and not (self.folder / MANIFEST).exists():
+            raise UserError(
+                f"no finished {self.kind.name} data at {self.folder}: "
+                f"set data.generate=true or run {self.make_command()}"
+            )
+
     def prepare(self) -> None:
         """Makes sure that the data are there and are right; the first time that can take minutes.
 
@@ -208,13 +220,9 @@ class RecordedSource(VideoSource):
             UserError: they are missing and cannot or may not be made, are damaged, or the disk is full.
         """
         with told():
+            RecordedSource.refuse_missing(self)
             folder = self.folder
             if not (folder / MANIFEST).exists():
-                if not self.generate:
-                    command = self.make_command()
-                    raise UserError(
-                        f"no finished {self.kind.name} data at {folder}: set data.generate=true or run {command}"
-                    )
                 self.make()
             manifest = check(folder, self.kind, self.plan())
             refuse_damage(folder, manifest, self.verify, self.kind.repair_command.format(root=folder))

@@ -22,6 +22,13 @@ class VideoSource(ABC):
     labelled: bool = True
     sets: Mapping[str, VideoSet]
 
+    def refuse_missing(self) -> None:  # noqa: B027 - most data can be made, so nothing is missing
+        """Looks whether everything that cannot be made is there; opens no video, so a sweep asks for each of its jobs.
+
+        Raises:
+            UserError: it is not.
+        """
+
     @abstractmethod
     def prepare(self) -> None:
         """Makes sure that the data are there and are right; the first time that can take minutes.

@@ -92,6 +92,15 @@ class OwnVideosSource(RecordedSource):
         }
         self._split_by: SplitBy = split_by
 
+    def refuse_missing(self) -> None:
+        """Looks whether the path names videos; whether they can be read is found out by `prepare`.
+
+        Raises:
+            UserError: it names none, or a recording of other settings.
+        """
+        if self._ready is None:
+            find(self.path)
+
     def prepare(self) -> None:
         """Looks at the videos and cuts them, unless that has been done before.
 

@@ -62,6 +62,19 @@ class SketchySource(VideoSource):
         self.workers, self.verify = workers, verify
         self.sets: dict[str, Sketchy] = {}
 
+    def refuse_missing(self) -> None:
+        """Looks whether the recording is there and finished.
+
+        Raises:
+            UserError: it is not; with the command that makes it.
+        """
+        if not (self.folder / MANIFEST).exists():
+            begun = "is not finished" if (self.folder / KIND.journal).exists() else "is not there"
+            raise UserError(
+                f"{self.folder} {begun}: prepare it with {self._command()}, where FOLDER holds the episodes; "
+                f"{COMMAND} --help says how to get them."
+            )
+
     def prepare(self) -> None:
         """Makes sure that the recording is there and right.
 
@@ -72,12 +85,7 @@ class SketchySource(VideoSource):
             refuse_damage(self.folder, self._manifest(), self.verify, self._command("--repair"))
 
     def _manifest(self) -> Manifest[dict[str, Any]]:
-        if not (self.folder / MANIFEST).exists():
-            begun = "is not finished" if (self.folder / KIND.journal).exists() else "is not there"
-            raise UserError(
-                f"{self.folder} {begun}: prepare it with {self._command()}, where FOLDER holds the episodes; "
-                f"{COMMAND} --help says how to get them."
-            )
+        self.refuse_missing()
         with told():
             return check(self.folder, KIND)
 
