@@ -109,13 +109,16 @@ def test_stored_videos_are_those_that_are_drawn(tmp_path: Path, capsys: pytest.C
 
 
 def test_without_stored_nothing_is_written(tmp_path: Path) -> None:
-    made = SpritesSource(train=2, val=1, test=1, root=str(tmp_path))
+    made = SpritesSource(train=2, val=1, test=1, generate=False, root=str(tmp_path))
+    made.refuse_missing()
     made.prepare()
     made.open()
     assert made.sets["train"][0]["video"].shape == (20, 3, 128, 128)
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(UserError, match=r"no finished sprites data at .*: set data.generate=true or run"):
-        SpritesSource(stored=True, generate=False, root=str(tmp_path)).prepare()
+    stored = SpritesSource(stored=True, generate=False, root=str(tmp_path))
+    for missed in (stored.refuse_missing, stored.prepare):
+        with pytest.raises(UserError, match=r"no finished sprites data at .*: set data.generate=true or run"):
+            missed()
 
 
 def test_the_fingerprint_changes_with_every_setting() -> None:

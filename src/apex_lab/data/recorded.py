@@ -207,6 +207,9 @@ class RecordedSource(VideoSource):
         Raises:
             UserError: they are not.
         """
+        self._refuse_unmade()
+
+    def _refuse_unmade(self) -> None:
         if not self.generate and not (self.folder / MANIFEST).exists():
             raise UserError(
                 f"no finished {self.kind.name} data at {self.folder}: "
@@ -220,7 +223,7 @@ class RecordedSource(VideoSource):
             UserError: they are missing and cannot or may not be made, are damaged, or the disk is full.
         """
         with told():
-            RecordedSource.refuse_missing(self)
+            self._refuse_unmade()
             folder = self.folder
             if not (folder / MANIFEST).exists():
                 self.make()

@@ -142,6 +142,15 @@ class SpritesSource(RecordedSource):
             **{"image_size": image_size, "min_objects": min_objects, "max_objects": max_objects},
         }
 
+    def refuse_missing(self) -> None:
+        """Looks whether data that may not be made are there; what is drawn as it is read is never missing.
+
+        Raises:
+            UserError: they are not.
+        """
+        if self.stored:
+            super().refuse_missing()
+
     def prepare(self) -> None:
         """Draws what is to be stored and is not there; else there is nothing to do."""
         if self.stored:
